@@ -232,10 +232,12 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
         messages = _on_day(path, messages, options.day)
         if options.ground.stated:
             messages = _at_height(path, kind, messages, options, notes, folder)
-        images = options.lines is not None and options.lines.files and (topics is None or topics.topics is None)
-        strip = _strip_of(options, options.lines) if images and options.lines is not None else None
-        if strip is not None and folder is not None:
-            strip = within(strip, *sensor_extent(folder)[0], "sensors")
+        given = options.lines
+        files = given is not None and given.files and (topics is None or given.topics is None)
+        strip = _strip_of(options, given) if files and given is not None else None
+        if strip is not None:
+            span = sensor_span(path, kind, options) if folder is None else sensor_extent(folder)[0]
+            strip = strip if span is None else within(strip, *span, "sensors")
     else:
         track = read_track(path, kind, options)
         notes.extend(track.notes)
@@ -319,6 +321,21 @@ def _image_alone(path: Path, options: Options) -> Imported:
     camera = options.camera
     first = [] if camera is None else [Message("configuration/camera", start, camera_message(camera), "import")]
     return Imported("lines", with_lines(first, strip, notes), notes)
+
+
+def sensor_span(path: Path, kind: str, options: Options) -> tuple[int, int] | None:
+    """UTC of the first and the last moment at which a bag or positions have GNSS and, where they have any, inertial
+    data or attitudes; None where there is no such moment.
+    """
+    ends: dict[str, tuple[int, int]] = {}
+    for message in read_any(path, kind, Options(options.day, grade=options.grade, without_images=True)).messages:
+        first, last = ends.get(message.topic, (message.stamp_ns, message.stamp_ns))
+        ends[message.topic] = min(first, message.stamp_ns), max(last, message.stamp_ns)
+    moving = next((topic for topic in ("sensor/imu", "sensor/attitude") if topic in ends), "sensor/gnss")
+    if "sensor/gnss" not in ends:
+        return None
+    begin, end = (f(ends[topic][k] for topic in ("sensor/gnss", moving)) for k, f in ((0, max), (1, min)))
+    return (begin, end) if begin <= end else None
 
 
 def within(strip: ImageStrip, begin_ns: int, end_ns: int, what: str) -> ImageStrip:

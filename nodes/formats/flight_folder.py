@@ -31,7 +31,7 @@ from .block_folder import read_ground_points
 from .block_messages import SIGMAS
 from .camera_json import read_camera
 from .dem import read_dem
-from .detect import KINDS, Imported, Options, kind_of_path, read_any, read_track, within
+from .detect import KINDS, Imported, Options, kind_of_path, read_any, read_track, sensor_span, within
 from .envi_image import TYPES
 from .geocal_xml import read_glas_camera
 from .ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
@@ -127,6 +127,11 @@ class Instead:
     kind: str = ""
     day: date | None = None
     lines: LinesGiven | None = None
+
+    @property
+    def files(self) -> LinesGiven | None:
+        """The image files of a strip; None for topics of a bag."""
+        return self.lines if self.lines is not None and self.lines.files and self.lines.topics is None else None
 
     @property
     def options(self) -> tuple[str, ...]:
@@ -250,7 +255,7 @@ def read_flight(folder: Path, live: bool | None = None, instead: Instead | None 
         _beside_platform(flight, flight.tables, tables["mounting"])
     flight.attempt(lambda: _ground(flight, tables["dem"], tables["flight"]))
     flight.attempt(lambda: _control(flight, tables["control"], tables["flight"]))
-    given = others.lines if others.lines is not None and others.lines.topics is None and others.lines.files else None
+    given = others.files
     for keys in strips or [] if given is None else []:
         if instead is not None and not keys.has("images"):
             id = keys.raw("id")
@@ -337,6 +342,7 @@ def flight_messages(folder: Path, instead: Instead | None = None) -> tuple[Impor
         accuracy=_accuracy(flight.sigmas),
         ground=flight.ground if flight.ground.stated else GroundGiven(flight.ground_height_m),
         poses_only=bool(flight.strips),
+        without_images=instead is not None and instead.files is not None,
         grade=flight.grade,
         folder=flight.tables,
     )
@@ -538,10 +544,10 @@ def _navigation(flight: Flight, keys: Keys, live: bool, instead: Instead) -> Non
         if kind not in NAVIGATION:
             raise keys.refuse("file", f"poses or sensors, not a {KINDS[kind]}")
     if kind == "ros2":
-        if instead.lines is not None:
-            flight.lines = instead.lines
-        else:
+        if instead.lines is None:
             _image_topics(flight, keys)
+        elif instead.files is None:
+            flight.lines = instead.lines
     elif instead.navigation is None:
         of_bag = [keys.name(key) for key in ("images", "line_rate_hz") if keys.has(key)]
         flight.problems.extend(f"{keys.path}: {key}: goes with a ROS 2 bag, not with {KINDS[kind]}" for key in of_bag)
@@ -549,7 +555,8 @@ def _navigation(flight: Flight, keys: Keys, live: bool, instead: Instead) -> Non
     if kind in ("sensors", "ros2"):
         if kind == "sensors":
             flight.tables = read_sensor_folder(path)
-        next(iter(read_any(path, kind, replace(options, folder=flight.tables)).messages), None)
+        options = replace(options, folder=flight.tables, without_images=instead.files is not None)
+        next(iter(read_any(path, kind, options).messages), None)
         if flight.tables is not None:
             flight.span_ns, flight.places_deg = sensor_extent(flight.tables)
     else:
@@ -716,6 +723,8 @@ def _open(flight: Flight, given: LinesGiven) -> None:
     """Add the images of a strip."""
     track = flight.track
     strip = open_strip(given, flight.camera, track.time_ns if track is not None and track.line_rate_hz > 0 else None)
+    if flight.span_ns is None and flight.kind == "ros2" and flight.navigation is not None:
+        flight.span_ns = sensor_span(flight.navigation, flight.kind, Options(flight.day))
     if flight.span_ns is not None:
         strip = within(strip, *flight.span_ns, "poses" if track is not None else "sensors")
     notes = () if flight.camera is None else strip.notes  # a missing camera is told once

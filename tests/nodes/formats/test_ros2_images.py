@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from envi_files import write_camera
+from envi_files import write_camera, write_image
 from test_ros2 import IMAGE, SQLITE, START_NS, _header, _type, fix, image, imu, write_bag
 
 from triline.nodes.cli import main
@@ -150,3 +150,39 @@ def test_without_a_camera_the_topics_name_the_lines(tmp_path, names):
     topics = {m.topic for m in read_any(write_bag(tmp_path / "bag", bag)).messages if m.topic.startswith("sensor")}
     wanted = {"/a/image": "a", "/b/image": "b", "/image": "N", "/other/image": "other"}
     assert topics == {f"sensor/lines/{wanted[name]}" for name in names}
+
+
+@pytest.mark.parametrize("beside", ["", "folder", "option"])
+def test_files_of_image_lines_are_held_against_the_times_of_a_bag(beside, tmp_path, capsys):
+    """As against those of sensor folders and poses: lines of another day went in without a word; and without a flight
+    folder no lines at all.
+    """
+    fixes = [("/fix", START_NS + i * 10**9, fix(START_NS + i * 10**9, 600.0)) for i in range(3)]
+    write_bag(tmp_path / "bag", [*fixes, *views()])
+    write_camera(tmp_path / "camera.json", SAMPLES)
+    write_image(tmp_path / "n.img", np.ones((90, SAMPLES, 1), dtype=np.uint8))
+    first = np.datetime64(START_NS, "ns")
+    toml = (
+        '[flight]\ncrs = "EPSG:32632"\nvertical_datum = "ellipsoid"\nground_height_m = 300.0\n'
+        '[camera]\nfile = "camera.json"\n[navigation]\nfile = "bag"\n'
+    )
+    strip = '[[strips]]\nid = "S"\nimages = {N = "n.img"}\nline_rate_hz = 100\nfirst_time = '
+    out = ["-o", str(tmp_path / "out.mcap")]
+
+    def imported(time) -> int:
+        lines = ["--lines", f"N={tmp_path / 'n.img'}", "--strip", "S", "--first-time", f"{time}Z", "--line-rate", "100"]
+        (tmp_path / "flight.toml").write_text(toml + (f'{strip}"{time}Z"\n' if beside == "folder" else ""))
+        if beside == "folder":
+            return main(["import", str(tmp_path), *out])
+        more = ["--flight", str(tmp_path)] if beside else ["--camera", str(tmp_path / "camera.json")]
+        return main(["import", str(tmp_path / "bag"), *lines, *more, *out])
+
+    assert imported(first) == 0
+    assert "outside the time" not in capsys.readouterr().out
+    blocks = [message.body for message in RecordingReader(tmp_path / "out.mcap").messages(["sensor/lines/N"])]
+    assert sum(len(block.pixels) for block in blocks if block.strip == "S") == 90
+    assert ({block.strip for block in blocks} == {"S"}) == (beside != "folder")  # which has the images of the bag, too
+    assert imported(first - np.timedelta64(250, "ms")) == 0
+    assert "strip S: 25 of 90 lines outside the time of the sensors" in capsys.readouterr().out
+    assert imported(first + np.timedelta64(1, "D")) == 1
+    assert "strip S: lines from 20" in (error := capsys.readouterr().err) and "but sensors from" in error
