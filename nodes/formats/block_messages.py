@@ -137,16 +137,21 @@ class _Times:
         whole = np.floor(t)
         return self._reference_ns + whole.astype(np.int64) * SECOND_NS + np.rint((t - whole) * 1e9).astype(np.int64)
 
-    def of_looks(self, block: BlockData) -> NDArray[np.int64]:
-        """(n,) stamps of the image points: when they were imaged, within their strip; those without strip come last."""
+    def of_looks(self, block: BlockData) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """When the image points (n,) were imaged, ns, 0 where that is out of the question; and their stamps: the same
+        within their strip, those without strip come last.
+        """
         strip, time = block.image.strip, block.image.time_s
         stamps = np.full(len(strip), max(end for _, end in self.extents), dtype=np.int64)
+        imaged = np.zeros(len(strip), dtype=np.int64)
         for i, (begin, end) in enumerate(self.extents):
             mine = np.flatnonzero(strip == i)
             low, high = ((edge - self._reference_ns) * 1e-9 for edge in (begin, end))
-            inside = self.ns(np.clip(time[mine] + self.shift[i], low - 1.0, high + 1.0))
-            stamps[mine] = np.clip(inside, begin, end - 1)
-        return stamps
+            shifted = time[mine] + self.shift[i]
+            near = np.clip(shifted, low - 1.0, high + 1.0)
+            imaged[mine] = np.where(near == shifted, self.ns(near), 0)
+            stamps[mine] = np.clip(self.ns(near), begin, end - 1)
+        return imaged, stamps
 
 
 def _project(block: BlockData) -> Any:
@@ -225,7 +230,7 @@ def _tie_messages(block: BlockData, times: _Times, source: str) -> Iterator[Mess
     if not len(image):
         return
     of_sample = image.sigma_px if image.sigma_sample_px is None else image.sigma_sample_px
-    time_ns = times.of_looks(block)
+    imaged, time_ns = times.of_looks(block)
     order = np.lexsort((time_ns, image.strip, image.point))
     key = np.stack([image.point[order], image.strip[order]])
     first = np.flatnonzero(np.concatenate([[True], (np.diff(key, axis=1) != 0).any(axis=0)]))
@@ -243,6 +248,6 @@ def _tie_messages(block: BlockData, times: _Times, source: str) -> Iterator[Mess
                 sample=image.sample[row],
                 sigma_line=image.sigma_px[row],
                 sigma_sample=of_sample[row],
-                time_ns=int(time_ns[row]),
+                time_ns=int(imaged[row]),
             )
         yield Message("observation/tie", int(stamps[group]), body, source)
