@@ -11,6 +11,9 @@ Array = NDArray[np.floating]
 SAME_LINES = 0.02
 #: Lines that come again with a time that is off by more, lines, are others: their numbers have begun anew. Definition.
 OTHER_LINES = 20.0
+#: Lines go on so much later than by the rate at most, s, or earlier by this share of the lines: four times as fast.
+#: Definition: what is beyond is no time of the line, and a wrong number would need room for all lines between.
+PAUSE_S, FASTER = 5.0, 0.75
 #: Lines for which there is room at first.
 _ROOM = 4096
 
@@ -47,43 +50,47 @@ class LineTimes:
     def add(self, first_line: int, time_s: ArrayLike) -> None:
         """Times (n,) of lines that follow each other; of lines that are known already they are compared only.
 
+        A time that is a little before that of an earlier line, as stamps of two views may be, is passed over.
+
         Raises
         ------
-        ValueError : times that are not finite, do not go on from line to line or from earlier lines, or are others than
-            those lines had before
+        ValueError : times that are not finite, far off those that lines had before, or far off where lines go on
         """
         t = np.asarray(time_s, dtype=float)
-        if not np.isfinite(t).all() or (np.diff(t) <= 0).any():
-            raise ValueError(f"times of the lines from {first_line} on do not go on from line to line")
-        off = (t - self.time_of(np.arange(first_line, first_line + len(t)))) * self.rate
-        again = max(min(self._seen - first_line, len(t)), 0)
-        if again and np.abs(off[:again]).max() > OTHER_LINES:
+        line = np.arange(first_line, first_line + len(t))
+        if not np.isfinite(t).all():
+            raise ValueError(f"times of the lines from {first_line} on are not finite")
+        off = (t - self.time_of(line)) * self.rate
+        fresh = line >= self._seen
+        pause, ahead = (PAUSE_S * self.rate, FASTER * (line - self._seen + 1)) if self._seen else (np.inf, np.inf)
+        wrong = np.where(fresh, (off > pause) | (off < -ahead - OTHER_LINES), np.abs(off) > OTHER_LINES)
+        if wrong.any():
+            k = int(np.argmax(wrong))
             raise ValueError(
-                f"line {first_line} came {off[0]:+.0f} lines off its time; a strip that begins anew wants another name"
+                f"line {line[k]} came {off[k]:+.0f} lines off its time; a strip that begins anew wants another name"
             )
-        fresh, line = t[again:], first_line + again
-        if not len(fresh):
+        before = self.time_of(self._seen - 1) if self._seen else -np.inf
+        fresh &= t > np.maximum.accumulate(np.concatenate([[before], t]))[:-1]
+        if not fresh.any():
             return
-        if self._seen and fresh[0] <= self.time_of(self._seen - 1):
-            raise ValueError(f"line {line} came before line {self._seen - 1} by its time")
-        if self._count or np.abs(off[again:]).max() >= SAME_LINES:
-            self._enter(line, fresh)
-        self._seen = line + len(fresh)
+        line, t = line[fresh], t[fresh]
+        if self._count or np.abs(off[fresh]).max() >= SAME_LINES:
+            self._enter(line, t)
+        self._seen = int(line[-1]) + 1
 
-    def _enter(self, line: int, time_s: Array) -> None:
+    def _enter(self, line: NDArray[np.int_], time_s: Array) -> None:
         """Put times of lines into the table, and between them those of lines that have not come."""
-        if not self._count:
-            self._begin = line
-        gap = line - self._begin - self._count
-        count = self._count + gap + len(time_s)
+        if self._count:
+            known = self._begin + self._count - 1
+            line, time_s = np.append(known, line), np.append(self._table[self._count - 1], time_s)
+        else:
+            self._begin = int(line[0])
+        count = int(line[-1]) + 1 - self._begin
         if count > len(self._table):
             grown = np.empty(max(2 * count, _ROOM))
             grown[: self._count] = self._table[: self._count]
             self._table = grown
-        if gap:
-            before = self._table[self._count - 1]
-            self._table[self._count : self._count + gap] = np.linspace(before, time_s[0], gap + 2)[1:-1]
-        self._table[self._count + gap : count] = time_s
+        self._table[self._count : count] = np.interp(np.arange(self._begin + self._count, line[-1] + 1), line, time_s)
         self._count = count
 
     def time_of(self, line: ArrayLike) -> Array:

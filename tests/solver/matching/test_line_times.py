@@ -47,12 +47,28 @@ def test_what_cannot_be():
         times = LineTimes(5.0, 100.0)
         times.add(0, begun)
         before = times.time_of(np.arange(120.0))
-        for first, t, told in (
-            (100, [6.5, 6.4], "do not go on from line to line"),
-            (100, [6.5, np.nan], "do not go on from line to line"),
-            (100, [5.5, 5.6], "line 100 came before line 99 by its time"),
-            (0, [9.0, 9.01], "line 0 came \\+[0-9]+ lines off its time; a strip that begins anew wants another name"),
+        for first, t in (
+            (0, [9.0, 9.01]),  # begun anew under its name
+            (100, [5.0, 5.01]),  # a second too early
+            (100, [13.0, 13.01]),  # after a pause of seven seconds
+            (10**12, [6.1, 6.11]),  # a number that a bit was lost of
         ):
+            told = rf"line {first} came [+-]\d+ lines off its time; a strip that begins anew wants another name"
             with pytest.raises(ValueError, match=told):
                 times.add(first, np.array(t))
+        with pytest.raises(ValueError, match="times of the lines from 100 on are not finite"):
+            times.add(100, np.array([6.5, np.nan]))
         np.testing.assert_array_equal(times.time_of(np.arange(120.0)), before)
+        times.add(100, np.array([9.0, 9.01]))  # after a pause
+        assert times.time_of(100.0) == 9.0
+
+
+def test_stamps_of_two_views_that_go_back_a_little():
+    """They come from programs, are off by a line and more, and belong to the same lines."""
+    rng, times = np.random.default_rng(2), LineTimes(5.0, 1000.0)
+    for first in range(0, 4000, 50):
+        for _ in "FN":
+            times.add(first, 5.0 + np.arange(first, first + 50) / 998.0 + 5e-4 * rng.standard_normal(50))
+    u = np.arange(3990.0)
+    assert (np.diff(times.time_of(u)) > 0).all()
+    assert np.abs(times.time_of(u) - 5.0 - u / 998.0).max() < 3e-3
