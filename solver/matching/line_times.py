@@ -69,8 +69,8 @@ class LineTimes:
             raise ValueError(
                 f"line {line[k]} came {off[k]:+.0f} lines off its time; a strip that begins anew wants another name"
             )
-        before = self.time_of(self._seen - 1) if self._seen else -np.inf
-        fresh &= t > np.maximum.accumulate(np.concatenate([[before], t]))[:-1]
+        before = float(self.time_of(self._seen - 1)) if self._seen else -np.inf
+        fresh &= t > np.maximum.accumulate(np.append(before, t))[:-1]
         if not fresh.any():
             return
         line, t = line[fresh], t[fresh]
