@@ -19,10 +19,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...adjustment.pose_noise import in_step
 from ...arrays import Array
 from ...camera.displacement import Displacement, displacements, most_certain
 from ...camera.self_calibration import lens, tls
 from ...quantiles import chi2
+from ..screening.look_noise import NoiseOfLooks
 from ..state.batch import Batch
 from ..state.network import LiveNetwork
 from ..state.unknowns import Border
@@ -77,7 +79,7 @@ class CameraCheck:
     """
 
     def __init__(self, network: LiveNetwork) -> None:
-        self._network, camera = network, network.camera
+        self._network, self._looks, camera = network, NoiseOfLooks(network), network.camera
         self._set, self._remedy = (tls(camera), "tls12") if len(camera.lenses) == 1 else (lens(camera), "lens")
         kinds = [name.split("_")[0] for name in self._set.unknown_names]
         self._watched = np.array([kind in WATCHED for kind in kinds])
@@ -112,8 +114,8 @@ class CameraCheck:
         score, V, rays = self._scores()
         if rays < LEAST_RAYS:
             return None
-        # looks that disagree as a whole are a matter of sigmas
-        variance = max(float(self._network.sigmas.disagreement), 1.0) ** 2
+        # looks that disagree as a whole are a matter of sigmas, and a vibration may be in step with the views
+        variance = max(float(self._network.sigmas.disagreement), 1.0) ** 2 * in_step(self._looks.vibrating)
         all_of_it, m = _chi_square(score, V)
         by_others, k = _chi_square(score[self._watched], V[np.ix_(self._watched, self._watched)])
         if m <= k:

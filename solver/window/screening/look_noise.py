@@ -72,10 +72,22 @@ class NoiseOfLooks:
 
     def unstated(self, ratio: float) -> float:
         """Share of the variance of looks that nobody stated at first, where it is so many times what is stated now."""
+        image, vibration = self._variances()
+        return 1.0 - 1.0 / ((image + vibration) * ratio)
+
+    @property
+    def vibrating(self) -> float:
+        """Share of the variance of looks that is a vibration of the attitude."""
+        image, vibration = self._variances()
+        return vibration / (image + vibration)
+
+    def _variances(self) -> tuple[float, float]:
+        """Of a sample by noise of the image and by vibration, in units of the variance that was stated at first."""
         sigmas, noise = self._network.sigmas, self._network.pose_noise
+        if not noise.vibration:
+            return sigmas.image**2, 0.0
         pixel, sigma = _pixel_and_sigma([b.rays for b in list(self._network.batches)[-MOST_JUDGED:]])
-        total = sigmas.image**2 + (noise.vibration / pixel / (sigma / sigmas.image)) ** 2
-        return 1.0 - 1.0 / (total * ratio)
+        return sigmas.image**2, (noise.vibration / pixel / (sigma / sigmas.image)) ** 2
 
     def ratio_now(self) -> float:
         """As `median_ratio`, of the newest looks, judged by the solution as it is now."""
