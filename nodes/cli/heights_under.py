@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..errors import UserError
 from ..formats.height_raster import HeightRaster
+from .named_files import named_files
 
 Array = NDArray[np.floating]
 
@@ -26,17 +27,7 @@ def rasters_of_heights(names: Iterable[str]) -> list[Path]:
     ------
     UserError : a folder without any
     """
-    out: list[Path] = []
-    for name in names:
-        path = Path(name)
-        if path.is_dir():
-            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in _NAMES)
-            if not inside:
-                raise UserError(f"{path}: no rasters of heights in it ({', '.join(_NAMES)})")
-            out += inside
-        else:
-            out.append(path)
-    return out
+    return named_files(map(Path, names), _NAMES, "rasters of heights")
 
 
 class NothingUnder(UserError):

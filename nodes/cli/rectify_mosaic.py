@@ -48,6 +48,7 @@ from ..recording.reader import RecordingReader
 from . import rectify_image
 from .damage import tell_damage, tell_other_camera, tell_other_frame
 from .heights_under import rasters_of_heights
+from .named_files import named_files
 from .outputs import refuse_over_files
 from .progress import progress
 from .rectify_recording import Prepared, cells_of, check_strips, pixels_together, prepared
@@ -190,17 +191,10 @@ def _check(args: argparse.Namespace, outputs: Outputs) -> None:
 
 def _kinds(args: argparse.Namespace) -> list[tuple[str, Path, str | None]]:
     """What each input is: recording, image (with its metadata), orthoimage (with its sigmas)."""
-    inputs: list[Path] = []
     for path in args.input:
         if not path.exists():
             raise UserError(f"{path}: no such file")
-        if path.is_dir():
-            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in _RECORDINGS)
-            if not inside:
-                raise UserError(f"{path}: no recordings in it (.mcap)")
-            inputs += inside
-        else:
-            inputs.append(path)
+    inputs = named_files(args.input, _RECORDINGS, "recordings")
     images = [p for p in inputs if p.suffix.lower() not in _RECORDINGS]
     sensors = args.sensor or []
     if sensors and len(sensors) != len(images):

@@ -214,13 +214,14 @@ class LiveStrips:
         off = np.median(np.abs(times / self._period_ns - lines)[-LEAST_FITTED:])
         if len(lines) < LEAST_FITTED or np.ptp(lines) < 1 or (self._fit is None and off < OFF_LINES):
             return
-        if self._fit is None:
-            nominal, found = SECOND_NS / self._period_ns, SECOND_NS / np.polyfit(lines, times, 1)[0]
-            self.told.append(
-                f"{self._strip}: {found:.2f} lines/s come, not {nominal:.2f}, line_rate_hz; lines get times by that"
-            )
         middle = lines.mean()
         period, at_middle = np.polyfit(lines - middle, times, 1)
+        if self._fit is None:
+            found, known = SECOND_NS / period, SECOND_NS / self._period_ns
+            self.told.append(
+                f"{self._strip}: {found:.2f} lines/s come, not {known:.2f} as line_rate_hz or the strip before says; "
+                "lines get their times by the stamps"
+            )
         self._fit = float(at_middle - period * middle), float(period)
 
     def _own_times(self, line: int, rows: int, first_ns: float, period_ns: float) -> NDArray[np.int64]:

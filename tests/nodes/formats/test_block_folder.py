@@ -217,8 +217,12 @@ def test_repeated_measurements_count_once(tmp_path):
     assert "image_points.csv: 1 rows repeat a measurement and were left out" in block.notes
 
 
-def test_line_times_from_a_file(tmp_path):
-    strips = "strip,first_line_time_s,line_rate_hz,lines,line_times\nS1,,,,lines.csv\n"
+@pytest.mark.parametrize(
+    "strips",
+    ["strip,first_line_time_s,line_rate_hz,lines,line_times\nS1,,,,lines.csv\n", "line_times,strip\nlines.csv,S1\n"],
+    ids=["with the columns that it replaces", "without"],
+)
+def test_line_times_from_a_file(strips, tmp_path):
     folder = write_files(tmp_path, strips=strips, image_points="point,strip,ccd,line,sample\nG1,S1,N,1.5,1\n")
     (folder / "lines.csv").write_text("line,time_s\n0,100\n1,100.1\n2,100.3\n")
     block = read_block(folder)
@@ -232,14 +236,8 @@ def test_line_times_from_a_file(tmp_path):
         read_block(folder)
 
 
-def test_columns_that_line_times_replace_may_be_absent(tmp_path):
-    image_points = "point,strip,ccd,line,sample\nG1,S1,N,1.5,1\n"
-    folder = write_files(tmp_path, strips="line_times,strip\nlines.csv,S1\n", image_points=image_points)
-    (folder / "lines.csv").write_text("line,time_s\n0,100\n1,100.1\n2,100.3\n")
-    block = read_block(folder)
-    np.testing.assert_allclose(block.image.time_s, 100.2)
-    assert block.strips[0].lines == 3
-    (folder / "strips.csv").write_text("line_times,strip\n,S1\n")
+def test_columns_that_line_times_replace_are_wanted_without_these(tmp_path):
+    folder = write_files(tmp_path, strips="line_times,strip\n,S1\n")
     with pytest.raises(UserError, match=r"strips.csv:2: first_line_time_s: missing, wanted a number \(or a file"):
         read_block(folder)
     (folder / "strips.csv").write_text("strip,lines\nS1,3\n")

@@ -170,7 +170,7 @@ def test_rigorous_rpc_and_dlt_images_in_one_block():
 
 @pytest.mark.parametrize("assumed", [True, False])
 def test_corrections_of_an_rpc_that_nobody_stated_are_no_observations(assumed):
-    """Usual sigmas are wide, so that data decide; as observations that fit by a wonder they make sigma0 too small."""
+    """Usual sigmas are wide, so that data decide; as observations that fit far too well they make sigma0 too small."""
     tiny = DgrOptions((1e-3,) * 3, (1e-7,) * 3, (1e-9,) * 3)
     squares = []
     for seed in range(12):
