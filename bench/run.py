@@ -220,6 +220,7 @@ BENCHMARKS = (
         "How long does it take from a tie point on the bus to the orientation that uses it?",
         (
             "python bench/tie_latency.py",
+            "python bench/tie_latency.py --loops 1",
             "python bench/tie_latency.py --selfcal tls18 --computed",
         ),
         4,

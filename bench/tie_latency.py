@@ -1,21 +1,25 @@
 """Tie point published to refined orientation received, over the bus: publisher and adjuster are two processes.
 
-    python bench/tie_latency.py [--rays 500] [--window 40] [--seconds 75] [--selfcal none] [--computed]
+    python bench/tie_latency.py [--rays 500] [--window 40] [--seconds 75] [--selfcal none]
+                                 [--computed] [--loops 0]
 
 A flight with so many tie rays a second is simulated and navigated beforehand; then its poses, tie points and control
 are published at the pace of their stamps, and an adjuster (``triline node adjuster``) answers. A tie point is answered
 by the first ``orientation/live`` that comes after the ``point/object`` of that point: it was computed with the point in
 the window. Tie points count once the window is full. Times are wall time, or with ``--computed``, which needs no bus,
-processor times, for machines that others use as well.
+processor times, for machines that others use as well. With ``--loops N`` other programs keep N cores busy meanwhile.
 """
 
 from __future__ import annotations
 
 import argparse
+import subprocess
+import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import frame
@@ -23,6 +27,7 @@ import numpy as np
 from tie_latency_computed import computed
 
 from triline.nodes.bus.pacing import publish_paced
+from triline.nodes.bus.priority import go_first
 from triline.nodes.bus.processes import NodeGroup
 from triline.nodes.bus.session import Bus
 from triline.nodes.node import Message
@@ -85,6 +90,13 @@ def prepare(folder: Path, args: argparse.Namespace) -> Path:
     return navigated
 
 
+def busy_loop(over: ExitStack) -> None:
+    """A program of another session that takes all that it gets of a core, till the end."""
+    program = subprocess.Popen([sys.executable, "-c", "while True: pass"], start_new_session=True)
+    over.callback(program.wait)
+    over.callback(program.kill)
+
+
 def main() -> None:
     parser = frame.parser(__doc__, as_json=True)
     parser.add_argument("--rays", type=float, default=500.0, help="tie rays a second")
@@ -93,6 +105,7 @@ def main() -> None:
     parser.add_argument("--selfcal", default="none", help="set of additional parameters")
     parser.add_argument("--update-rays", type=int, default=12, help="an update as soon as so many wait")
     parser.add_argument("--computed", action="store_true", help="from processor times, without the bus")
+    parser.add_argument("--loops", type=int, default=0, help="cores that other programs keep busy")
     parser.add_argument("--port", type=int, default=17621)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
@@ -104,8 +117,15 @@ def main() -> None:
             found = computed(recording, TOPICS, named, 11.0 + args.window, 8.0 + args.seconds)
             frame.show(found, args.json)
             return
+        go_first()  # as the nodes do for which this program stands
         ears = Ears()
-        with NodeGroup(folder, "bench", args.port) as group, Bus("bench", source="bench", port=args.port) as bus:
+        with (
+            ExitStack() as over,
+            NodeGroup(folder, "bench", args.port) as group,
+            Bus("bench", source="bench", port=args.port) as bus,
+        ):
+            for _ in range(args.loops):
+                busy_loop(over)
             settings = (
                 f"window_s={args.window}",
                 f'self_calibration="{args.selfcal}"',

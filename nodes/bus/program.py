@@ -14,7 +14,12 @@ from typing import Any
 
 from ..config import Tables
 from .bundle import Bundle
+from .priority import go_first
 from .session import Bus
+
+#: What is late where another program takes the processor is lost, or comes too late for who flies: these nodes go
+#: before others. The matcher and whoever draws use what is left.
+GO_FIRST = ("nmea", "lines", "ros2", "stream", "navigator", "adjuster", "recorder", "router")
 
 
 def _silent(text: str) -> None:
@@ -49,10 +54,13 @@ class ProgramOptions:
         return self.tables.get(self.name, {})
 
     def open_bus(self) -> Bus:
-        """The bus, with the node's name as source."""
+        """The bus, with the node's name as source; a node that must not wait asks for a higher priority before."""
+        niceness = go_first() if self.name in GO_FIRST else 0
         bus = Bus(self.platform, source=self.name, port=self.port, file=self.bus_file, secure=self.secure)
         if alone := bus.why_alone():
             self.report(alone)
+        if niceness < 0:
+            self.report(f"{self.name} goes before other programs (niceness {niceness})")
         return bus
 
 
