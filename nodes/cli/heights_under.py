@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...solver.location.frame_camera import FrameCamera
 from ..errors import UserError
 from ..formats.height_raster import HeightRaster
 from .named_files import named_files
@@ -16,6 +17,8 @@ Array = NDArray[np.floating]
 
 #: Rounds in which pixels are looked up between the heights of the round before; they end where none is new.
 MOST_ROUNDS = 10
+#: Rays are looked at from so far below a frame camera on; the terrain is searched from one metre more.
+BELOW_CAMERA_M = 2.0
 #: Rasters that are looked for in a folder of heights.
 _NAMES = (".hgt", ".tif", ".tiff", ".bil", ".img", ".dt1", ".dt2", ".vrt")
 
@@ -66,6 +69,13 @@ def height_range(
             break
         known = low, high
     return low, high
+
+
+def below_camera(model: object, low_m: float, high_m: float) -> tuple[float, float]:
+    """Heights between which rays meet a terrain that lies between some: an aircraft in a valley sees what is below."""
+    if isinstance(model, FrameCamera):
+        high_m = min(high_m, float(model.ellipsoid.geodetic(model.position_e)[2]) - BELOW_CAMERA_M)
+    return min(low_m, high_m), high_m
 
 
 def _along_rays(

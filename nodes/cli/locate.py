@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
-from ...solver.location.frame_camera import FrameCamera
 from ...solver.location.refraction import STANDARD, Atmosphere, Refraction
 from ...solver.location.rpc import Rpc
 from ...solver.location.uncertainty import Sigmas, ground_derivatives, pixel_covariance
@@ -23,7 +22,7 @@ from ..errors import UserError
 from ..formats.height_raster import DATUMS, HeightRaster
 from ..formats.new_file import new_file
 from ..formats.table import Column, Table, read_table, write_table
-from .heights_under import NothingUnder, height_range, rasters_of_heights
+from .heights_under import NothingUnder, below_camera, height_range, rasters_of_heights
 from .location_model import SENSORS, Model, read_location_model
 from .outputs import refuse_over_files
 
@@ -39,8 +38,6 @@ _HEIGHT = Column("height_m")
 _NO_HEIGHT = Column("height_m", optional=True, blank=True)
 #: Pixels meet the terrain in groups of squares of the image with so many pixels a side: one window of the raster each.
 SQUARE_PX = 2048
-#: Rays are looked at from so far below a frame camera on; the terrain is searched from one metre more.
-BELOW_CAMERA_M = 2.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -246,9 +243,7 @@ def _met(model: Model, u: Array, v: Array, terrain: HeightRaster, scene: str, no
             if len(rest) == len(u):
                 notes.append(str(reason))
             break
-        if isinstance(model, FrameCamera):  # an aircraft in a valley looks at what is below it
-            high = min(high, float(model.ellipsoid.geodetic(model.position_e)[2]) - BELOW_CAMERA_M)
-        low = min(low, high)
+        low, high = below_camera(model, low, high)
         squares = np.column_stack([u[rest] // SQUARE_PX, v[rest] // SQUARE_PX])
         _, of = np.unique(squares, axis=0, return_inverse=True)
         for k in range(int(of.max()) + 1):

@@ -29,7 +29,7 @@ from ..formats.height_raster import DATUMS, HeightRaster
 from ..formats.new_file import refuse_unless_file
 from ..formats.projection import notes_of_map, unit_of
 from ..formats.table import Column, read_table
-from .heights_under import height_range, rasters_of_heights
+from .heights_under import below_camera, height_range, rasters_of_heights
 from .locate import with_refraction
 from .location_model import SENSORS, read_location_model
 from .outputs import refuse_over_files
@@ -382,6 +382,7 @@ def ground_under(args: argparse.Namespace, sensor: _Sensor) -> Ground:
     low, high = height_range(
         lambda h: edge_of(model, Ground(h, h, h, 1.0, ""), 60), raster, guess, args.sensor, "the pixels of the image"
     )
+    low, high = below_camera(model if isinstance(model, FrameCamera) else sensor.bare, low, high)
     u, v = np.meshgrid(np.linspace(0, model.lines - 1, 25), np.linspace(0, model.samples - 1, 25))
     met = meet_terrain(model, u.ravel(), v.ravel(), raster, low, high)
     covered = float(np.isfinite(met.lat).mean())

@@ -328,6 +328,33 @@ def test_a_frame_camera_and_its_sigmas(tmp_path):
     assert np.nanmin(planimetric) > 15.0 and np.nanmax(planimetric) < 30.0 and np.nanmax(np.abs(up - 5.0)) < 1e-3
 
 
+@pytest.mark.parametrize("summit_m", [0.0, 3000.0])
+def test_a_frame_camera_in_a_valley_under_summits(summit_m, tmp_path):
+    low = json.loads(json.dumps(FRAME))
+    low["interior"] |= {"focal_length_mm": 100.0, "pixel_size_mm": 0.1, "distortion": {}}
+    low["exterior"] |= {"lat_deg": 47.0, "lon_deg": 11.0, "height_m": 2500.0, "omega_phi_kappa_deg": [4.0, -15.0, 33.0]}
+    meta = tmp_path / "frame.json"
+    meta.write_text(json.dumps(low))
+    camera, _ = read_frame(meta, [])
+    valley = Waves(47.02, 10.98, 1e-4, 400, 500, low_m=550.0, high_m=650.0)
+    valley.z[189, 300] += np.float32(summit_m)
+    line, sample = np.mgrid[0:300, 0:400]
+    image = write_image(tmp_path / "frame.tif", np.stack([line, sample]).astype(np.float32), nodata=-1.0)
+    dem = valley.write(tmp_path / "valley.tif")
+    out = rectify(tmp_path, image, meta, "--dem", dem, "--dem-datum", "ellipsoid", "--crs", "EPSG:32632")
+    from pyproj import Transformer
+
+    values = out.read()
+    row, column = np.argwhere((values[0] > 20) & (values[0] < 280))[::997].T
+    x, y = np.array(out.xy(row, column))
+    lon, lat = np.radians(Transformer.from_crs(32632, 4326, always_xy=True).transform(x, y))
+    height = valley.at(lat, lon)
+    flat = height < 650.0
+    assert len(row) > 50 and flat.mean() > 0.9
+    true = camera.inverse(lat[flat], lon[flat], height[flat])
+    assert pytest.approx(true, abs=0.05) == values[:, row[flat], column[flat]].T
+
+
 @pytest.mark.parametrize(("option", "value"), [("--ccd", "F"), ("--model", "rpc")])
 def test_a_frame_camera_has_one_model_and_no_lines(option, value, tmp_path, capsys):
     """Both were taken, and the orthoimage was that without them."""
