@@ -23,13 +23,11 @@ def go_first() -> int:
     """
     if not hasattr(os, "setpriority") or threading.current_thread() is not threading.main_thread():
         return 0  # a node in a thread is part of a program of another kind
-    stated = os.getpriority(os.PRIO_PROCESS, 0)
-    if stated:
-        return stated
-    for wanted in (URGENT, min(_permitted(), 0)):
-        with suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, 0, wanted)
-            break
+    if os.getpriority(os.PRIO_PROCESS, 0) == 0:
+        for wanted in (URGENT, min(_permitted(), 0)):
+            with suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, 0, wanted)
+                break
     granted = os.getpriority(os.PRIO_PROCESS, 0)
     if granted < 0 and os.getsid(0) == os.getpid():
         with suppress(OSError):  # no such file, or not permitted

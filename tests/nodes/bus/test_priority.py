@@ -45,6 +45,17 @@ def test_who_was_started_with_a_niceness_keeps_it(system, stated):
     assert priority.go_first() == stated == system.now
 
 
+@pytest.mark.parametrize(("stated", "written"), [(0, "-10"), (-5, "-5"), (5, "")])
+def test_who_leads_its_session_asks_for_the_session_too(system, stated, written, monkeypatch, tmp_path):
+    """With a priority that it has of the program that started it as well."""
+    system.lowest, system.now = -20, stated
+    monkeypatch.setattr(os, "getsid", lambda process: os.getpid())
+    monkeypatch.setattr(priority, "_SESSION", tmp_path / "autogroup")
+    (tmp_path / "autogroup").touch()
+    priority.go_first()
+    assert (tmp_path / "autogroup").read_text() == written
+
+
 def test_it_is_asked_of_the_system_itself():
     """In a process of its own, which may or may not be allowed to: it says what there is then."""
     code = "import os; from triline.nodes.bus import priority; print(priority.go_first(), os.getpriority(0, 0))"
