@@ -35,9 +35,9 @@ PACES = ("load", "normal", "throughput")
 THROUGHPUT_S, IN_DOUBT_S = 10.0, 1.0
 #: Where so many image points a second come there is an update as soon as the oldest has waited for ``WAIT_S``, with
 #: half of ``update_rays`` at least: waiting for others was the longest part of the time to an answer, and where more
-#: come, each update takes more of them instead of following sooner. `bench/tie_latency.py --computed`, 500 a second:
-#: 99 % of the answers within 32 ms instead of 44, for a tenth more processor time; 10 ms take a third more and give no
-#: more, 15 and 20 ms give 34 and 39.
+#: come, each update takes more of them instead of following sooner. Tuned with `bench/tie_latency.py --computed`, 500 a
+#: second: 99 % of the answers come within 32 ms instead of 44, for a tenth more processor time; with 10 ms a third more
+#: gains nothing, and 15 and 20 ms give 34 and 39.
 FAST_HZ, WAIT_S = 240.0, 0.012
 #: How far the time of a pose can be after the stamp of its message, s: what goes beyond is no flight, and unknowns for
 #: all of it would take the memory and the time of the others.

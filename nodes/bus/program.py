@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from ..config import Tables
+from ..registry import SENSORS
 from .bundle import Bundle
 from .priority import go_first
 from .session import Bus
 
 #: What is late where another program takes the processor is lost, or comes too late for who flies: these nodes go
 #: before others. The matcher and whoever draws use what is left.
-GO_FIRST = ("nmea", "lines", "ros2", "stream", "navigator", "adjuster", "recorder", "router")
+GO_FIRST = (*SENSORS, "navigator", "adjuster", "recorder", "router")
 
 
 def _silent(text: str) -> None:

@@ -72,7 +72,7 @@ def height_range(
 
 
 def below_camera(model: object, low_m: float, high_m: float) -> tuple[float, float]:
-    """Heights between which rays meet a terrain that lies between some: an aircraft in a valley sees what is below."""
+    """Lowest and highest height of a terrain that the sensor can see: a frame camera sees what is below it alone."""
     if isinstance(model, FrameCamera):
         high_m = min(high_m, float(model.ellipsoid.geodetic(model.position_e)[2]) - BELOW_CAMERA_M)
     return min(low_m, high_m), high_m

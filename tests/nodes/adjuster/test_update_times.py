@@ -13,9 +13,9 @@ from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 
 EPOCH = 1_700_000_000_000_000_000
+#: Of attitudes, and so of poses.
 RATE_HZ = 200.0
-
-
+#: Tie points are handed over from then on, s: a short time of a full flow of them is enough.
 TIES_FROM_S = 19.5
 
 
@@ -27,7 +27,7 @@ def flown(ties_per_s):
     navigator, messages = Navigator(), []
     for message in Simulator(simulation).messages(EPOCH):
         if message.topic in Navigator.inputs:
-            messages += [o for o in navigator.step(message) if o.topic in ("trajectory/filtered",)]
+            messages += [o for o in navigator.step(message) if o.topic == "trajectory/filtered"]
         early = message.topic == "observation/tie" and message.stamp_ns < EPOCH + TIES_FROM_S * 1e9
         if message.topic in Adjuster.inputs and not early:
             messages.append(message)

