@@ -1,6 +1,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+COMMA := ,
 # tests and studies use processes, not BLAS threads
 export OPENBLAS_NUM_THREADS ?= 1
 # workers of the tests: one more than the two cores, since tests of the bus wait a good part of their time
@@ -19,24 +20,30 @@ help:
 	@echo "make schemas compile the protobuf files"
 	@echo "make golden  make the golden recording and its results anew"
 
-# a virtual environment with the package; made again when the dependencies change
-$(VENV)/.run: pyproject.toml
+# A virtual environment with the package, $(1); made again when the dependencies change. pip compiles its byte code on one
+# core, compileall on all.
+define install
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable .
+	$(BIN)/python -m pip install --quiet --no-compile --editable '$(1)'
+	-@$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib >/dev/null
 	@touch $@
+endef
 
-$(VENV)/.dev: $(VENV)/.run
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
-	@touch $@
+$(VENV)/.run: pyproject.toml
+	$(call install,.)
 
-$(VENV)/.bench: $(VENV)/.dev
-	$(BIN)/python -m pip install --quiet --editable '.[bench]'
-	@touch $@
+$(VENV)/.dev: pyproject.toml
+	$(call install,.[dev])
+	@touch $(VENV)/.run
 
-$(VENV)/.docs: $(VENV)/.run
-	$(BIN)/python -m pip install --quiet --editable '.[docs]'
-	@touch $@
+$(VENV)/.bench: pyproject.toml
+	$(call install,.[dev$(COMMA)bench])
+	@touch $(VENV)/.run $(VENV)/.dev
+
+$(VENV)/.docs: pyproject.toml
+	$(call install,.[docs])
+	@touch $(VENV)/.run
 
 demo: $(VENV)/.run
 	$(BIN)/triline demo
