@@ -13,9 +13,8 @@ small bends smoothly, and its residuals in single a-priori equations say little 
 other. Those of offset and of shift and drift are weighed where the squared residuals of their few a-priori equations
 are significantly more than their redundancy. A factor falls again where the data no longer ask for it, and never below
 1: a trajectory that is stated too good costs much, one that is stated too bad next to nothing. Where that of a wander
-falls, the wander that is present keeps what it had: it may be all in one step of the GNSS, which a mean over the window
-no longer shows. Not where noise of the looks, or the other wander, has been found larger since, which had been taken
-for it.
+falls, the wander that is present may keep what it had (`kept_wanders`); not where noise of the looks has been found
+larger since, which had been taken for it.
 
 Noise of the looks (`look_noise`) comes after the trajectory. But few looks with much noise look as if the trajectory
 wandered, and a wander that is stated so large would follow their noise from then on. So before one is stated larger,
@@ -36,6 +35,7 @@ from ..state.network import LiveNetwork
 from ..state.sigma_factors import CHANGED, LARGEST, MOST_UP, changed
 from ..state.strip import WindowStrip
 from .disagreement import CLEARLY, Disagreement
+from .kept_wanders import KeptWanders
 from .likelihood import Likelihood, likely
 from .look_noise import LEAST_LOOKS, NoiseOfLooks
 
@@ -54,8 +54,6 @@ LEAST_REDUNDANCY = 0.2
 STEADY = 3
 #: Each time looks show a wander, both wanders are stated so many times as large. Tuned.
 RAISED = 1.5
-#: The other wander was meant where its factor has become so many times as large since. Tuned.
-MOVED = 2.0
 #: What the operator is told of the additional parameters.
 CALIBRATION = "calibration of the camera"
 #: A factor is told again when it differs by so much from what was told last.
@@ -88,8 +86,7 @@ class SigmaCheck:
         self._steady = 0
         self._told_platform: set[str] = set()
         self._likelihoods: dict[tuple[int, int], Likelihood] = {}
-        # largest factor of the wanders of position and attitude, and that of the other one then
-        self._largest, self._beside = np.ones(2), np.ones(2)
+        self._kept = KeptWanders()
         self.events: list[str] = []
 
     def look(self, now_s: float, due: bool, turns: int = 1) -> tuple[bool, bool]:
@@ -168,26 +165,15 @@ class SigmaCheck:
         """State the sigmas of slow errors anew, with factors (4,) that the residuals of a strip ask for."""
         sigmas, state = self._network.sigmas, self._network.state
         sigmas.apriori, before = factor, state.changes
-        kept = self._kept(factor[list(WANDERS)])
+        kept = (False, False)
+        # where they were noise of looks nothing has happened
+        if sigmas.image == 1.0 and not self._network.pose_noise.vibration:
+            equations = strip.equations_present(state)[list(WANDERS)]
+            kept = self._kept.keeps(factor[list(WANDERS)], equations, strip.final_to_s)
         groups = {each: each.restate_sigmas(factor, state, kept) for each in self._network.flown}
         for pair, cost in self._likelihoods.items():
             if cost.changes == before and all(g <= ({*pair} if s is strip else set()) for s, g in groups.items()):
                 cost.changes = state.changes
-
-    def _kept(self, factor: Array) -> tuple[bool, bool]:
-        """Whether the wanders (2,) of position and attitude that are present keep the largest factors they have had.
-
-        Not where noise of looks has been found that had been taken for them, nor where the other one has become much
-        larger since: then it was that one all along.
-        """
-        if self._network.sigmas.image > 1.0 or self._network.pose_noise.vibration:
-            return False, False
-        other = factor[::-1]
-        moved = (factor < self._largest) & (other > MOVED * self._beside)
-        new = moved | (factor >= self._largest)
-        self._largest[new], self._beside[new] = factor[new], other[new]
-        position, attitude = (~moved).tolist()
-        return position, attitude
 
     def _slow_errors(self, strip: WindowStrip, now_s: float, due: bool) -> tuple[Array, bool]:
         """Factors (4,) that the residuals of a-priori equations ask for; whether the noise of looks was stated anew,

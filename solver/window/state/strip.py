@@ -12,6 +12,7 @@ from ...geometry.trajectory import Poses
 from ...models import MODELS
 from ...models.base import (
     CONSTANT,
+    ERROR_GROUPS,
     WANDERS,
     CorrectionModel,
     Design,
@@ -313,6 +314,10 @@ class WindowStrip:
         columns = self._prior.columns[rows]
         present = (columns < 0) | (state.places(self.numbers[np.maximum(columns, 0)]) >= 0)
         return rows[present.all(axis=1)]
+
+    def equations_present(self, state: WindowState) -> IntArray:
+        """Number of a-priori equations of each group (4,) that are present, by `ERROR_GROUPS`."""
+        return np.bincount(self._group[self._rows_present(state)], minlength=len(ERROR_GROUPS))
 
     def restate_sigmas(self, factor: Array, state: WindowState, kept: tuple[bool, bool] = (False, False)) -> set[int]:
         """Multiply the a-priori sigmas by other factors (4,), of what is present and of what is to come; returns the

@@ -27,6 +27,7 @@ from triline.solver.simulation.window_study import (
 from triline.solver.window.quality.light import GOOD
 from triline.solver.window.results import TAKEN_BACK, WindowOptions
 from triline.solver.window.screening.disagreement import ENOUGH, RIGHT, Disagreement, variance_of_most
+from triline.solver.window.screening.kept_wanders import KeptWanders
 from triline.solver.window.screening.likelihood import USUAL_LOG, Likelihood, LookNoise, likely
 from triline.solver.window.screening.sigma_check import SigmaCheck
 from triline.solver.window.state.network import LiveNetwork
@@ -233,18 +234,37 @@ def test_a_wander_falls_where_noise_of_looks_was_taken_for_it(camera_network, mo
     for factor in (5.0, 1.0):
         monkeypatch.setattr(check, "_slow_errors", lambda *_, f=factor: (np.full(4, f), False))
         check.look(9.0, due=True)
+        strip.final_to_s = 9.0  # what asked for the larger one has left
     assert strip.apriori()[3] == pytest.approx(np.where(np.arange(len(stated)) < GLOBALS, 1.0, left) * stated)
 
 
-def test_a_wander_falls_where_the_other_one_was_meant(camera_network):
+def kept(wanders: KeptWanders, *factors: list[float], equations=30, final_to_s=0.0):
+    """What is said of factors of the wanders of position and attitude, one after the other."""
+    return [wanders.keeps(np.array(f), np.full(2, equations), final_to_s) for f in factors]
+
+
+def test_a_wander_falls_where_the_other_one_was_meant():
     """A step of the GNSS stays large; what the position was blamed for and the attitude did does not."""
-    step = SigmaCheck(camera_network, Disagreement(camera_network.sigmas))
-    assert [step._kept(np.array(f)) for f in ([3.0, 1.0], [4.0, 1.5], [1.0, 1.2])] == [(True, True)] * 3
-    swing = SigmaCheck(camera_network, Disagreement(camera_network.sigmas))
-    assert swing._kept(np.array([4.0, 7.0])) == (True, True)
-    assert swing._kept(np.array([3.0, 12.0])) == (True, True)
-    assert swing._kept(np.array([2.0, 26.0])) == (False, True)
-    assert swing._kept(np.array([1.5, 26.0])) == (True, True)  # it has fallen, and keeps that
+    step, swing = KeptWanders(), KeptWanders()
+    assert kept(step, [3.0, 1.0], [4.0, 1.5]) + kept(step, [1.0, 1.2], final_to_s=9.0) == [(True, True)] * 3
+    assert kept(swing, [4.0, 7.0]) + kept(swing, [3.0, 12.0], final_to_s=9.0) == [(True, True)] * 2
+    # it has fallen, and keeps that
+    assert kept(swing, [2.0, 26.0], [1.5, 26.0], final_to_s=9.0) == [(False, True), (True, True)]
+
+
+@pytest.mark.parametrize(
+    ("factor", "equations", "final_to_s", "keeps"),
+    [
+        (2.0, 32, 7.0, False),  # the same data and more ask for less
+        (2.8, 64, 7.0, True),  # a step: its square is spread over twice as many equations
+        (2.0, 32, 8.0, True),  # what asked for it may have left
+    ],
+)
+def test_a_wander_that_the_same_data_no_longer_ask_for_falls(factor, equations, final_to_s, keeps):
+    """Position and attitude are both blamed at first, until more data tell which of them it was."""
+    wanders = KeptWanders()
+    assert kept(wanders, [4.0, 9.0], final_to_s=7.0) == [(True, True)]
+    assert kept(wanders, [factor, 9.0], equations=equations, final_to_s=final_to_s) == [(keeps, True)]
 
 
 @pytest.mark.parametrize("spoilt", [0.0, 0.36])
