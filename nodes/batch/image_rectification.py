@@ -400,7 +400,7 @@ class ImageRectification:
                 old = target.read(row, column, *missing.shape)
                 values = np.where(got, values, old)
                 target.write(row, column, values)
-                new = got & ~(old != self.nodata).any(axis=0)
+                new = got & ~self._held(old).any(axis=0)
                 filled += int(new.sum())
                 self.counts.cells[MISSING[4]] += int((new & (missing == 4)).sum())
                 if classes is not None:
@@ -414,6 +414,10 @@ class ImageRectification:
             for tile in self.tiles():
                 m = classes.read(tile.row, tile.column, tile.rows, tile.columns)
                 classes.write(tile.row, tile.column, np.where(m >= 10, m - 10, 1).astype(np.uint8))
+
+    def _held(self, values: NDArray[Any]) -> Mask:
+        """Where values of the orthoimage are something."""
+        return ~np.isnan(values) if np.isnan(self.nodata) else values != self.nodata
 
     def _block(self, first: tuple[int, int]) -> Any:
         """Patch of the orthoimage under a block of pixels: row, column, values, missing, and which cells are new."""

@@ -207,6 +207,18 @@ def test_direct_way_gives_the_same_orthoimage(scene, tmp_path):
     assert ((mask == 0) == (two[0] > 0)).all()
 
 
+def test_direct_way_of_an_image_whose_empty_cells_are_no_numbers(scene, tmp_path, capsys):
+    _, path, *_ = scene
+    pixels = np.full((1, TRUTH.lines, TRUTH.samples), 0.25, dtype=np.float32)
+    pixels[:, 100:150, 100:150] = np.nan
+    image = write_image(tmp_path / "reflectance.tif", pixels)
+    args = ["rectify", image, "--sensor", path, "--height", "100", "--direct", "--json", "-o", tmp_path / "o.tif"]
+    assert main([str(word) for word in args]) == 0
+    cells = json.loads(capsys.readouterr().out)["cells"]
+    found = rasterio.open(tmp_path / "o.tif").read(1)
+    assert cells["value"] == (found == 0.25).sum() > 0.5 * TRUTH.lines * TRUTH.samples
+
+
 def test_bits_bands_no_data_and_resampling(scene, tmp_path):
     _, path, *_ = scene
     rng = np.random.default_rng(2)
