@@ -80,7 +80,7 @@ class SourceImage:
     """
 
     def __init__(self, path: Path, nodata: float | None = None):
-        self.file = RasterFile(path)
+        self.file = RasterFile(path, overviews=False)  # pixels that are put together are means of all of them
         source = self.file.source
         self.path, self.lines, self.samples = path, self.file.rows, self.file.columns
         self.bands, self.dtype = self.file.count, np.dtype(self.file.dtype)

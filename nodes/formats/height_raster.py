@@ -31,15 +31,20 @@ EDGE_CELLS = 1e-6
 class RasterFile:
     """One raster, open once in every thread that reads it.
 
+    Parameters
+    ----------
+    path : of the raster
+    overviews : see `open_raster`
+
     Raises
     ------
     UserError : not there, not a raster
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, *, overviews: bool = True):
         from rasterio.errors import RasterioError
 
-        self.path = path
+        self.path, self._overviews = path, overviews
         self._local = threading.local()
         if not is_there(path):
             raise UserError(f"{path}: no such file")
@@ -54,7 +59,7 @@ class RasterFile:
     def source(self) -> Any:
         """The dataset of this thread."""
         if not hasattr(self._local, "source"):
-            self._local.source = open_raster(self.path)
+            self._local.source = open_raster(self.path, overviews=self._overviews)
         return self._local.source
 
 

@@ -21,8 +21,14 @@ _METRES = ("", "m", "metre", "meter", "metres", "meters")
 _alone = threading.Lock()
 
 
-def open_raster(path: Path) -> Any:
+def open_raster(path: Path, *, overviews: bool = True) -> Any:
     """A dataset of rasterio, with or without georeference.
+
+    Parameters
+    ----------
+    path : of the raster
+    overviews : whether GDAL may take reduced values from overviews. These need not be means, nor lie where the means of
+        as many values do: places in them are off by a part of a reduced cell
 
     Raises
     ------
@@ -33,7 +39,18 @@ def open_raster(path: Path) -> Any:
 
     with warnings.catch_warnings(), _without_undecodable_messages():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        return rasterio.open(path)
+        return rasterio.open(path) if overviews else rasterio.open(path, OVERVIEW_LEVEL="NONE")
+
+
+def is_raster(path: Path) -> bool:
+    """Whether GDAL opens a file as a raster."""
+    from rasterio.errors import RasterioError
+
+    try:
+        open_raster(path).close()
+    except RasterioError:
+        return False
+    return True
 
 
 def unit_of_heights(source: Any) -> str:

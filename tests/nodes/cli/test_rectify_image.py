@@ -271,6 +271,20 @@ def test_degrees_bounds_and_larger_cells(scene, tmp_path):
     assert values[:, row, column] - 10.0 == pytest.approx(true, abs=0.02)
 
 
+def test_overviews_of_the_image_move_nothing(scene, tmp_path):
+    """What GDAL would read out of them lies up to a pixel elsewhere."""
+    from rasterio.enums import Resampling
+
+    _, path, *_ = scene
+    line, sample = np.mgrid[0 : TRUTH.lines, 0 : TRUTH.samples]
+    image = write_image(tmp_path / "image.tif", np.stack([line, sample]).astype(np.float32) + 10.0, nodata=-1.0)
+    args = ("--height", 100, "--gsd", 60)
+    wanted = rectify(tmp_path, image, path, *args, name="without.tif").read()
+    with rasterio.open(image, "r+") as target:
+        target.build_overviews([2, 4], Resampling.nearest)
+    np.testing.assert_array_equal(rectify(tmp_path, image, path, *args, name="with.tif").read(), wanted)
+
+
 def test_an_image_across_the_date_line(scene, tmp_path, capsys):
     """In degrees its two sides are 360 degrees apart; other systems have it in one piece."""
     _, _, model, _, _, image = scene
