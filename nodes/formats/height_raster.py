@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,8 @@ class HeightRaster:
         self._rows, self._columns = self._offsets()
         self.rows = max(row + file.rows for row, file in zip(self._rows, self._files, strict=True))
         self.columns = max(column + file.columns for column, file in zip(self._columns, self._files, strict=True))
+        self._turn = self._columns_a_turn()
+        self._middle: float | None = None
         from pyproj import Transformer
 
         base = flat.geodetic_crs if ellipsoid != WGS84 else "EPSG:4326"
@@ -161,6 +164,12 @@ class HeightRaster:
         self._t = type(t)(t.a, 0.0, t.c + left * t.a, 0.0, t.e, t.f + top * t.e)
         return [row - top for row in rows], [column - left for column in columns]
 
+    def _columns_a_turn(self) -> int:
+        """Columns round the planet where the raster has all of them, so that the last is next to the first; else 0."""
+        columns = abs(360.0 / self._t.a) if self._geographic else 0.0
+        whole = round(columns)
+        return whole if self.columns >= whole and abs(columns - whole) < 0.01 else 0
+
     def _datum(self, path: Path, datum: str | None, stated: Any) -> tuple[str, Any]:
         """Words of the datum, and a function of latitudes and longitudes (degrees) that gives its height."""
         if datum is None and stated is None:
@@ -192,15 +201,31 @@ class HeightRaster:
     # -- terrain -------------------------------------------------------------------------------------------------------
 
     def place(self, lat: Array, lon: Array) -> tuple[Array, Array]:
-        """See `Terrain.place`."""
+        """See `Terrain.place`; columns of a raster round the planet go on beyond its ends."""
         x, y = self._to_flat.transform(np.degrees(lon), np.degrees(lat))
         x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
         t = self._t
         if self._geographic:
-            middle = t.c + 0.5 * t.a * self.columns
+            middle = self._longitude(x)
             x = middle + (x - middle + 180.0) % 360.0 - 180.0
         x, y = np.where(np.isfinite(x), x, np.nan), np.where(np.isfinite(y), y, np.nan)
         return (y - t.f) / t.e - 0.5, (x - t.c) / t.a - 0.5
+
+    def _longitude(self, x: Array) -> float:
+        """Longitude opposite to the one at which columns jump, degrees.
+
+        It is that of the middle; of a raster round the planet, that of the first places that were looked up, so that
+        columns do not jump under an image.
+        """
+        middle = self._middle
+        if middle is None:
+            middle = self._t.c + 0.5 * self._t.a * self.columns
+            seen = np.radians(x[np.isfinite(x)])
+            if self._turn and len(seen):
+                middle = float(np.degrees(np.arctan2(np.sin(seen).mean(), np.cos(seen).mean())))
+            if len(seen):
+                self._middle = middle
+        return middle
 
     def undulation(self, lat: Array, lon: Array) -> Array:
         """See `Terrain.undulation`; NaN beyond the raster where nobody knows it.
@@ -216,7 +241,7 @@ class HeightRaster:
         if not unknown.any():
             return N
         row, column = self.place(lat, lon)
-        for at, count in ((row, self.rows), (column, self.columns)):
+        for at, count in ((row, self.rows), (column, self.columns))[: 1 if self._turn else 2]:
             unknown &= (at > EDGE_CELLS) & (at < count - 1 - EDGE_CELLS)
         if unknown.any():
             k = int(np.argmax(np.ravel(unknown)))
@@ -227,7 +252,7 @@ class HeightRaster:
     def heights(self, row: int, column: int, rows: int, columns: int) -> NDArray[np.float32]:
         """See `Terrain.heights`."""
         out = np.full((rows, columns), np.nan, dtype=np.float32)
-        for file, first_row, first_column in zip(self._files, self._rows, self._columns, strict=True):
+        for file, first_row, first_column in self._placed(column, columns):
             top, left = max(row, first_row), max(column, first_column)
             bottom = min(row + rows, first_row + file.rows)
             right = min(column + columns, first_column + file.columns)
@@ -237,6 +262,16 @@ class HeightRaster:
             part = out[top - row : bottom - row, left - column : right - column]
             part[:] = np.where(np.isnan(part), z, part)
         return out
+
+    def _placed(self, column: int, columns: int) -> Iterator[tuple[RasterFile, int, int]]:
+        """Files with their first row and column; of a raster round the planet those in a window, each time they are."""
+        for file, first_row, first_column in zip(self._files, self._rows, self._columns, strict=True):
+            turns = range(1)
+            if self._turn:
+                first, last = column - first_column - file.columns, column + columns - first_column
+                turns = range(first // self._turn + 1, -(-last // self._turn))
+            for turn in turns:
+                yield file, first_row, first_column + turn * self._turn
 
     def _window(self, file: RasterFile, *place: int) -> NDArray[np.float32]:
         """Heights of a window of one file, metres."""
@@ -256,7 +291,7 @@ class HeightRaster:
         if everywhere:
             top, left, height, width = 0, 0, self.rows, self.columns
         low, high, slack = np.inf, -np.inf, 0.0
-        for file, first_row, first_column in zip(self._files, self._rows, self._columns, strict=True):
+        for file, first_row, first_column in self._placed(left, width):
             r0, c0 = max(top, first_row) - first_row, max(left, first_column) - first_column
             r1 = min(top + height, first_row + file.rows) - first_row
             c1 = min(left + width, first_column + file.columns) - first_column
@@ -276,7 +311,7 @@ class HeightRaster:
     def _nearest(self, row: Array, column: Array) -> tuple[Array, Array]:
         """Latitudes and longitudes (n,), radians, of the places of the raster that are nearest to some."""
         t = self._t
-        x = t.c + t.a * (np.clip(column, 0, self.columns - 1) + 0.5)
+        x = t.c + t.a * ((column if self._turn else np.clip(column, 0, self.columns - 1)) + 0.5)
         y = t.f + t.e * (np.clip(row, 0, self.rows - 1) + 0.5)
         lon, lat = self._to_flat.transform(x, y, direction="INVERSE")
         return np.radians(lat), np.radians(lon)
@@ -284,14 +319,18 @@ class HeightRaster:
     def at(self, lat: Array, lon: Array) -> Array:
         """Heights above the ellipsoid (n,) at latitudes and longitudes (n,), radians, by one window."""
         row, column = self.place(lat, lon)
-        row, column = _within_edge(row, self.rows), _within_edge(column, self.columns)
+        row = _within_edge(row, self.rows)
+        if not self._turn:
+            column = _within_edge(column, self.columns)
         known = np.isfinite(row) & np.isfinite(column)
         out = np.full(np.shape(lat), np.nan)
         if not known.any():
             return out
-        top, left = max(int(row[known].min()) - 1, -2), max(int(column[known].min()) - 1, -2)
+        top, left = max(int(row[known].min()) - 1, -2), int(np.floor(column[known].min())) - 1
         bottom = min(int(row[known].max()) + 3, self.rows + 2)
-        right = min(int(column[known].max()) + 3, self.columns + 2)
+        right = int(np.floor(column[known].max())) + 3
+        if not self._turn:
+            left, right = max(left, -2), min(right, self.columns + 2)
         if bottom - top < 2 or right - left < 2:
             return out
         z = self.heights(top, left, bottom - top, right - left)

@@ -674,6 +674,26 @@ def test_a_geoid_as_large_as_heights_that_cover_a_part(scene, tmp_path, capsys):
     assert "smaller.tif: no geoid height at " in error
 
 
+@pytest.mark.parametrize("first", [-180.0, 0.0])
+@pytest.mark.parametrize("seam", [0.0, 180.0])
+def test_rasters_round_the_earth_have_no_gap_where_they_begin(scene, tmp_path, first, seam):
+    """Heights and geoid heights of the whole Earth, under images at both of the meridians where such rasters begin."""
+    _, _, model, _, _, image = scene
+    step = 1.0
+    lon = np.arange(first + 0.5 * step, first + 360.0, step)
+    z = np.broadcast_to(20.0 * np.cos(np.radians(lon)), (180, len(lon))).astype(np.float32)
+    world = write_image(
+        tmp_path / "world.tif", z[None], crs="EPSG:4326", transform=rasterio.Affine(step, 0, first, 0, -step, 90)
+    )
+    middle = np.degrees(model.direct([200.0], [150.0], [0.0])[0, 1])
+    path = write_dimap2(tmp_path / "seam.xml", replace(TRUTH, node_deg=TRUTH.node_deg + seam - middle))
+    args = ("--gsd", 10)
+    height = 20.0 * np.cos(np.radians(seam + 0.5 * step))  # the same on both sides of the meridian
+    wanted = rectify(tmp_path, image, path, *args, "--height", 2.0 * height, name="w.tif")
+    found = rectify(tmp_path, image, path, *args, "--dem", world, "--dem-datum", world, name="f.tif")
+    assert found.bounds == wanted.bounds and np.abs(found.read() - wanted.read()).max() < 0.01
+
+
 def test_heights_that_cover_a_part_and_tiles_of_heights(scene, tmp_path, capsys):
     _, path, _, relief, dem, image = scene
     half = tmp_path / "tiles"
