@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ...errors import UserError
 from ..keys import is_there
+from ..raster_open import is_raster
 from .csm_isd import read_isd
 from .dimap1 import read_dimap1
 from .dimap2 import read_dimap2
@@ -45,16 +46,18 @@ def read_scene(path: Path) -> SatelliteScene:
     suffix = path.suffix.lower()
     with open(path, "rb") as file:
         head = text_start(file.read(512))
+    if suffix in _IMAGES:  # a virtual raster is XML, too
+        return SatelliteScene("rpc", None, read_rpc_tags(path))
     if head.startswith("<"):
         return _read_xml_scene(read_xml(path))
-    if suffix in _IMAGES:
-        return SatelliteScene("rpc", None, read_rpc_tags(path))
     if suffix == ".rpb":
         return SatelliteScene("rpc", None, read_rpb(path))
     if suffix == ".geom" or path.name.upper().endswith("_RPC.TXT") or "LINE_OFF" in head.upper():
         return SatelliteScene("rpc", None, read_rpc_text(path))
     if suffix in (".json", ".isd") or head.startswith("{"):
         return read_isd(path)
+    if is_raster(path):
+        return SatelliteScene("rpc", None, read_rpc_tags(path))
     raise UserError(f"{path}: of no known kind, wanted one of: {'; '.join(KINDS.values())}")
 
 

@@ -1,8 +1,8 @@
 """Rational polynomials in files: tags of a GeoTIFF, .RPB, _RPC.TXT, DIMAP and OSSIM .geom.
 
 Pixels. RPC00B files (GeoTIFF, RPB, _RPC.TXT, geom) count lines and samples from 0 at the centre of the first pixel, as
-triline does (rasterio's ``rowcol`` counts from the corner and is half a pixel more). DIMAP counts rows and columns
-from 1.
+triline does (rasterio's ``rowcol`` counts from the corner and is half a pixel more). DIMAP 2 counts rows and columns
+from 1; DIMAP 3 (Pleiades Neo) as its domain of validity says, from 0.
 """
 
 from __future__ import annotations
@@ -188,6 +188,8 @@ def _text(path: Path) -> str:
 
 #: Where a DIMAP document has its polynomials: in a file of their own, and in that of the scene.
 _DIMAP_PLACES = ("Rational_Function_Model/Global_RFM", "Geoposition/Rational_Sensor_Model/Global_RFM")
+#: Names of the polynomials in DIMAP 2 and 3.
+_DIMAP_TO_IMAGE, _DIMAP_TO_GROUND = ("Inverse_Model", "GroundtoImage_Values"), ("Direct_Model", "ImagetoGround_Values")
 
 
 def has_dimap_rpc(root: Element) -> bool:
@@ -204,19 +206,30 @@ def read_dimap_rpc(root: Element, lines: int = 0, samples: int = 0) -> Rpc:
     """
     model = root.need(_DIMAP_PLACES[0], "rational polynomials", *_DIMAP_PLACES[1:])
     validity = model.find("RFM_Validity")
-    to_image = _dimap_functions(model, validity, inverse=True)
-    to_ground = _dimap_functions(model, validity, inverse=False) if model.find("Direct_Model") is not None else None
-    if not lines and validity is not None:
+    first, domain = (1.0, 1.0), None
+    if validity is not None and (domain := validity.find("ImagetoGround_Validity_Domain")) is not None:
+        first = domain.number("FIRST_COL"), domain.number("FIRST_ROW")
+    elif validity is not None:
         domain = validity.find("Direct_Model_Validity_Domain")
-        if domain is not None:
-            lines, samples = int(domain.number("LAST_ROW")), int(domain.number("LAST_COL"))
+    to_image = _dimap_functions(model, validity, first, inverse=True)
+    to_ground = None
+    if model.find(*_DIMAP_TO_GROUND) is not None:
+        to_ground = _dimap_functions(model, validity, first, inverse=False)
+    if not lines and domain is not None:
+        samples, lines = (int(domain.number(f"LAST_{a}") - f) + 1 for a, f in zip(("COL", "ROW"), first, strict=True))
     return checked(root.path, Rpc(to_image, to_ground, lines, samples))
 
 
-def _dimap_functions(model: Element, validity: Element | None, *, inverse: bool) -> RationalFunctions:
-    place = model.need("Inverse_Model" if inverse else "Direct_Model", "rational polynomials")
-    # in products the direct model has SAMP for longitude and LINE for latitude
+def _dimap_functions(
+    model: Element, validity: Element | None, first: tuple[float, float], *, inverse: bool
+) -> RationalFunctions:
+    """The polynomials of one direction; ``first``: the numbers of the first column and row."""
+    known, *others = _DIMAP_TO_IMAGE if inverse else _DIMAP_TO_GROUND
+    place = model.need(known, "rational polynomials", *others)
+    # in products of DIMAP 2 the direct model has SAMP for longitude and LINE for latitude
     names = (("SAMP", "LINE"), ("F_COL", "F_ROW") if inverse else ("F_LON", "F_LAT"))
+    if not inverse and place.find("LON_NUM_COEFF_1") is not None:
+        names = (("LON", "LAT"), names[1])
     if place.find(f"{names[0][0]}_NUM_COEFF_1") is not None:
         rows = [
             np.array([place.number(f"{axis}_{part}_COEFF_{k}") for k in range(1, 21)])
@@ -235,7 +248,7 @@ def _dimap_functions(model: Element, validity: Element | None, *, inverse: bool)
         else:
             part = validity.need(short, "offset and scale")
             of[short] = part.number("B"), part.number("A")
-    of["Col"], of["Row"] = ((of[axis][0] - 1.0, of[axis][1]) for axis in ("Col", "Row"))
+    of["Col"], of["Row"] = ((of[axis][0] - f, of[axis][1]) for axis, f in zip(("Col", "Row"), first, strict=True))
     ground, image = ("Lon", "Lat"), ("Col", "Row")
     ins, outs = (ground, image) if inverse else (image, ground)
     try:

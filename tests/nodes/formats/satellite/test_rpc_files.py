@@ -66,6 +66,33 @@ def write_dimap(path, rpc):
     return path
 
 
+def write_dimap3(path, rpc):
+    """As Pleiades Neo has them: other names, pixels from 0."""
+    text = write_dimap(path, rpc).read_text().replace("Inverse_Model>", "GroundtoImage_Values>")
+    samples, lines = rpc.to_image.out_offset
+    text = text.replace(f"<SAMP_OFF>{samples + 1:.17g}", f"<SAMP_OFF>{samples:.17g}")
+    text = text.replace(f"<LINE_OFF>{lines + 1:.17g}", f"<LINE_OFF>{lines:.17g}")
+    direct = "".join(
+        f"<{axis}_{part}_COEFF_{k}>{float(k == (1 if part == 'DEN' else one)):g}</{axis}_{part}_COEFF_{k}>"
+        for axis, one in (("LON", 2), ("LAT", 3)) for part in ("NUM", "DEN") for k in range(1, 21)
+    )  # fmt: skip
+    domain = "<FIRST_COL>0</FIRST_COL><FIRST_ROW>0</FIRST_ROW><LAST_COL>5999</LAST_COL><LAST_ROW>19999</LAST_ROW>"
+    direct = f"<ImagetoGround_Values>{direct}</ImagetoGround_Values>"
+    domain = f"<ImagetoGround_Validity_Domain>{domain}</ImagetoGround_Validity_Domain>"
+    path.write_text(text.replace("<RFM_Validity>", f"{direct}<RFM_Validity>{domain}"))
+    return path
+
+
+def write_copy(path, rpc):
+    """An image of another kind, which GDAL makes of a GeoTIFF."""
+    from rasterio.shutil import copy
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        copy(write_geotiff(path.with_suffix(".tif"), rpc), path, driver={".vrt": "VRT", ".pix": "PCIDSK"}[path.suffix])
+    return path
+
+
 def _rpb(path, rpc):
     write_rpb(path, rpc)
     return path
@@ -78,6 +105,7 @@ def _text(path, rpc):
 
 WRITERS = {
     "a.tif": write_geotiff, "a.RPB": _rpb, "a_RPC.TXT": _text, "a.geom": write_geom, "RPC_a.XML": write_dimap,
+    "RPC_PNEO.XML": write_dimap3, "a.vrt": write_copy, "a.pix": write_copy,
 }  # fmt: skip
 
 
@@ -88,6 +116,11 @@ def test_the_same_polynomials_come_back(name, rpc, tmp_path):
     u, v, h = rng.uniform(0, 20_000, 50), rng.uniform(0, 6000, 50), rng.uniform(0, 2000, 50)
     located = rpc.direct(u, v, h)
     np.testing.assert_allclose(back.inverse(*located.T), np.stack([u, v], axis=1), atol=1e-6)
+
+
+def test_size_of_an_image_of_dimap_3(rpc, tmp_path):
+    back = read_scene(write_dimap3(tmp_path / "RPC_PNEO.XML", rpc)).model()
+    assert (back.lines, back.samples) == (20_000, 6_000) and back.to_ground is not None
 
 
 @pytest.mark.parametrize("errors", [(3.0, 0.25), (0.0, 0.0)])
