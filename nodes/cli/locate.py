@@ -98,6 +98,7 @@ def run(args: argparse.Namespace) -> int:
     if sigmas.any and isinstance(model, Rpc):
         raise UserError(f"{args.sensor}: sigmas go with a rigorous model, this is an RPC")
     terrain = _terrain(args, model)
+    notes += [] if terrain is None else terrain.notes
     if args.pixels:
         columns, missed = _to_ground(Path(args.pixels), model, terrain, sigmas, notes, args.sensor)
     else:

@@ -379,6 +379,7 @@ def ground_under(args: argparse.Namespace, sensor: _Sensor) -> Ground:
             raise UserError(f"{args.sensor}: the image does not see the ground at {h:g} m")
         return ground
     raster = HeightRaster(rasters_of_heights(args.dem), args.dem_crs, args.dem_datum, sensor.ellipsoid)
+    sensor.notes.extend(raster.notes)
     low, high = height_range(
         lambda h: edge_of(model, Ground(h, h, h, 1.0, ""), 60), raster, guess, args.sensor, "the pixels of the image"
     )

@@ -14,6 +14,7 @@ from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
 from ...solver.rectification.terrain import bilinear
 from ..errors import UserError
 from .keys import is_there
+from .projection import notes_of_map
 from .raster_open import known_heights, open_raster, unit_of_heights
 
 Array = NDArray[np.floating]
@@ -76,6 +77,11 @@ class HeightRaster:
         CRS, where there is one, and depths where it counts downwards
     ellipsoid : of the sensor that looks at them
 
+    Attributes
+    ----------
+    name, datum : for people
+    notes : what is to be said of the places of the heights
+
     Raises
     ------
     UserError : no raster, turned, without CRS, of another planet, in feet that no CRS states, without a vertical
@@ -95,6 +101,7 @@ class HeightRaster:
         self._check_planet(first.path, whole, ellipsoid)
         flat, stated = _split(whole)
         self._flat = flat
+        self.notes = [f"{self.name}: {note}" for note in notes_of_map(flat.to_string(), what="these heights")]
         for file in self._files:
             self._check_file(file, first, crs is not None)
         t = first.transform

@@ -15,6 +15,8 @@ from ..errors import UserError
 
 #: A CRS by the code of an authority.
 _CODE = re.compile(r"[A-Za-z]+:\d+")
+#: A CRS that is written with more letters (WKT) is told by its name.
+_LONGEST_NAME = 60
 
 
 class Projection:
@@ -151,13 +153,14 @@ def notes_of_heights(crs: str) -> list[str]:
     return []
 
 
-def notes_of_map(crs: str, given: str = "local") -> list[str]:
+def notes_of_map(crs: str, given: str = "local", what: str = "the map") -> list[str]:
     """What is to be said of a map in a CRS to which PROJ knows a better way from WGS 84 than it has grids for.
 
     Parameters
     ----------
     crs : of the map; nothing is said of one in the local frame or of another planet
     given : of the control that places rest on: what it is off by, the way back to the same CRS takes off again
+    what : in words, what lies in the CRS
 
     Raises
     ------
@@ -172,9 +175,10 @@ def notes_of_map(crs: str, given: str = "local") -> list[str]:
     if given != "local" and flat == _horizontal(given):
         return []
     grids = missing_grids(flat.to_string())
-    what = "the map may be off by the datum shift, metres, all alike"
+    off = f"{what} may be off by the datum shift, metres, all alike"
+    name = crs if len(crs) < _LONGEST_NAME else flat.name
     return [
-        f"PROJ has no grid {', '.join(grids[:3])} here for {crs!r}; {what} (`projsync --file {grid}` fetches it)"
+        f"PROJ has no grid {', '.join(grids[:3])} here for {name!r}; {off} (`projsync --file {grid}` fetches it)"
         for grid in grids[:1]
     ]
 

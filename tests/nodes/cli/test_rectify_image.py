@@ -808,6 +808,24 @@ def test_a_map_whose_datum_shift_is_not_here(scene, tmp_path, capsys):
     assert notes_of_map("EPSG:31467", "EPSG:25832") and not notes_of_map("+proj=longlat +a=1737400 +b=1737400")
 
 
+def test_heights_whose_datum_shift_is_not_here(scene, tmp_path, capsys):
+    """Heights of a CRS that PROJ brings to WGS 84 but roughly lie metres beside their places."""
+    _, path, _, relief, dem, image = scene
+    if not missing_grids("EPSG:31467"):
+        pytest.skip("PROJ has the grid here")
+    shifted = rasterio.open(relief.write(tmp_path / "dhdn.tif", "EPSG:4314")).name
+    (tmp_path / "pixels.csv").write_text("column,row\n100,100\n")
+    of_image = ["rectify", str(image), "--sensor", str(path), "-o", str(tmp_path / "o.tif")]
+    of_pixels = ["locate", str(path), "--pixels", str(tmp_path / "pixels.csv"), "-o", str(tmp_path / "o.csv")]
+    for command in (of_image, of_pixels):
+        for heights, said in ((shifted, 1), (str(dem), 0)):
+            assert main([*command, "--dem", heights, "--dem-datum", "ellipsoid", "--json"]) == 0
+            notes = [note for note in json.loads(capsys.readouterr().out)["notes"] if "datum shift" in note]
+            assert len(notes) == said and all(
+                "dhdn.tif: PROJ has no grid de_adv_BETA2007.tif" in note for note in notes
+            )
+
+
 # -- real images ---------------------------------------------------------------------------------------------------
 
 VENTOUX = DATA / "satellites" / "phr_ventoux"
