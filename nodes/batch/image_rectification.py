@@ -86,7 +86,8 @@ class SourceImage:
         self.bands, self.dtype = self.file.count, np.dtype(self.file.dtype)
         if any(np.dtype(name).kind == "c" for name in source.dtypes):
             raise UserError(f"{path}: complex numbers, wanted grey values")
-        if len(set(source.dtypes)) > 1:
+        self._mixed = len(set(source.dtypes)) > 1
+        if self._mixed:
             self.dtype = np.result_type(*[np.dtype(name) for name in source.dtypes])
         self.nodata = nodata if nodata is not None else source.nodata
         # GDAL leaves out of means what the file states; what the command line does, it does not know
@@ -108,12 +109,19 @@ class SourceImage:
 
         window = Window(sample * factor, line * factor, samples * factor, lines * factor)  # type: ignore[call-arg]
         if factor == 1:
-            return self.file.source.read(window=window)
+            return self._read(window=window)
         if self._unstated:
-            return self._means(self.file.source.read(window=window), lines, samples, factor)
-        return self.file.source.read(
-            window=window, out_shape=(self.bands, lines, samples), resampling=Resampling.average
-        )
+            return self._means(self._read(window=window), lines, samples, factor)
+        return self._read(window=window, out_shape=(lines, samples), resampling=Resampling.average)
+
+    def _read(self, **how: Any) -> NDArray[Any]:
+        """All bands in the one type of the orthoimage; rasterio reads bands of different types one by one alone."""
+        read = self.file.source.read
+        if not self._mixed:
+            if "out_shape" in how:
+                how["out_shape"] = (self.bands, *how["out_shape"])
+            return read(**how)
+        return np.stack([read(band, **how).astype(self.dtype) for band in range(1, self.bands + 1)])
 
     def _means(self, pixels: NDArray[Any], lines: int, samples: int, factor: int) -> NDArray[Any]:
         """Means (bands, lines, samples) of the data among pixels, no data where there is none of it."""

@@ -236,6 +236,23 @@ def test_bits_bands_no_data_and_resampling(scene, tmp_path):
             assert set(np.unique(values)) <= set(np.unique(bands))
 
 
+@pytest.mark.parametrize("gsd", [10, 40])
+def test_bands_of_different_types(scene, tmp_path, gsd):
+    """A virtual raster may have them, and files of PCIDSK."""
+    from rasterio.shutil import copy
+
+    _, path, *_ = scene
+    line, sample = np.mgrid[0 : TRUTH.lines, 0 : TRUTH.samples] + 10
+    one = write_image(tmp_path / "one.tif", np.stack([line, sample]).astype(np.float32))
+    copy(one, tmp_path / "image.vrt", driver="VRT")
+    words = (tmp_path / "image.vrt").read_text().replace('"Float32" band="2"', '"UInt16" band="2"')
+    (tmp_path / "mixed.vrt").write_text(words)
+    args = ("--height", 100, "--gsd", gsd, "--nodata", -1)
+    wanted = rectify(tmp_path, one, path, *args, name="w.tif").read()
+    found = rectify(tmp_path, tmp_path / "mixed.vrt", path, *args, name="f.tif")
+    assert found.dtypes == ("float32", "float32") and np.abs(found.read() - wanted).max() < 0.01
+
+
 @pytest.mark.parametrize("stated", [7, None])
 def test_no_data_takes_no_part_where_pixels_are_put_together(scene, tmp_path, stated):
     """Whether the file states it or the command line does."""
