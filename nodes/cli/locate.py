@@ -264,11 +264,11 @@ def _met(model: Model, u: Array, v: Array, terrain: HeightRaster, scene: str, no
 
 
 def _outside(model: Model, u: Array, v: Array) -> NDArray[np.object_]:
-    """A note for pixels outside the image; an RPC may not know its size."""
+    """A note for pixels outside the image; an RPC may not know its size, but where it begins."""
     note = np.full(len(u), "", dtype=object)
-    if model.lines and model.samples:
-        inside = (u >= -0.5) & (u <= model.lines - 0.5) & (v >= -0.5) & (v <= model.samples - 0.5)
-        note[~inside] = f"outside the image of {model.samples} columns and {model.lines} rows"
+    ends = (model.lines or np.inf) - 0.5, (model.samples or np.inf) - 0.5
+    size = f" of {model.samples} columns and {model.lines} rows" if model.lines and model.samples else ""
+    note[~((u >= -0.5) & (u <= ends[0]) & (v >= -0.5) & (v <= ends[1]))] = f"outside the image{size}"
     return note
 
 
@@ -276,6 +276,10 @@ def _to_pixels(
     path: Path, model: Model, terrain: HeightRaster | None, sigmas: Sigmas, notes: list[str]
 ) -> tuple[dict[str, Any], int]:
     table = _table(path, _GROUND, terrain, notes)
+    if not (model.lines and model.samples):
+        notes.append(
+            "the polynomials do not say how large the image is: points beyond its last row or column have a pixel"
+        )
     table.refuse(np.abs(table["lat_deg"]) > 90.0, "lat_deg", lambda row: "a latitude beyond 90 degrees")
     lat, lon = np.radians(table["lat_deg"]), np.radians(table["lon_deg"])
     h = table["height_m"] if terrain is None else terrain.at(lat, lon)

@@ -152,9 +152,9 @@ class Rpc:
         if margin_px is None:
             return out
         with np.errstate(invalid="ignore"):
-            if self.lines and self.samples:
-                ends = np.array([self.lines, self.samples]) - 0.5 + margin_px
-                out[~((out >= -0.5 - margin_px) & (out <= ends)).all(axis=1)] = np.nan
+            # where the image begins is known, be its size known or not
+            ends = np.array([self.lines or np.inf, self.samples or np.inf]) - 0.5 + margin_px
+            out[~((out >= -0.5 - margin_px) & (out <= ends)).all(axis=1)] = np.nan
             beyond = np.abs(self.to_image.normalised(np.degrees(lon), np.degrees(lat), height_m)[:2]).max(axis=0)
             out[~(beyond <= _FARTHEST * (1.0 + margin_px / np.abs(self.to_image.out_scale).min()))] = np.nan
         return out

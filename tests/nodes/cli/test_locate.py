@@ -78,6 +78,23 @@ def test_rpc_beside_the_rigorous_model(scene, tmp_path, capsys):
     assert "no rpc model in a file of the kind dimap2" in capsys.readouterr().err
 
 
+def test_where_an_image_of_unknown_size_begins(scene, tmp_path, capsys):
+    """An .RPB file does not say how large the image is, but that its first pixel is that of row and column 0."""
+    rpc = fit_to_model(read_scene(scene).model("rigorous"), 0.0, 500.0).rpc
+    write_rpb(tmp_path / "scene.RPB", rpc)
+    lat, lon, height = rpc.direct([100.0, -50.0, 100.0], [100.0, 100.0, -50.0], 200.0).T
+    places = {"lon_deg": np.degrees(lon), "lat_deg": np.degrees(lat), "height_m": height}
+    pd.DataFrame(places).to_csv(tmp_path / "ground.csv", index=False)
+    pd.DataFrame({"column": [100, 100, -50], "row": [100, -50, 100], "height_m": 200}).to_csv(
+        tmp_path / "pixels.csv", index=False
+    )
+    for what, wanted in (("ground", "not in the image"), ("pixels", "outside the image")):
+        args = ["locate", tmp_path / "scene.RPB", f"--{what}", tmp_path / f"{what}.csv", "-o", tmp_path / "out.csv"]
+        assert main([str(word) for word in args]) == 0
+        assert pd.read_csv(tmp_path / "out.csv")["note"].fillna("").tolist() == ["", wanted, wanted]
+        assert ("do not say how large the image is" in capsys.readouterr().out) == (what == "ground")
+
+
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
