@@ -243,6 +243,8 @@ def _sensor(args: argparse.Namespace, image: SourceImage) -> _Sensor:
     bare = with_refraction(args, bare)
     ellipsoid = WGS84 if isinstance(bare, Rpc) else bare.ellipsoid
     unknown = isinstance(bare, Rpc) and not (bare.lines and bare.samples)
+    if isinstance(bare, Rpc) and path.resolve() == image.path.resolve():
+        unknown = _is_a_part(args, image)  # tags do not state the size of the scene
     line, sample = _first_pixel(args, image, bare, unknown, notes)
     if isinstance(bare, Rpc) and unknown:  # the scene reaches to the end of the image at least
         bare = replace(bare, lines=line + image.lines, samples=sample + image.samples)
@@ -259,6 +261,22 @@ def _sensor(args: argparse.Namespace, image: SourceImage) -> _Sensor:
         if fit.rejected.any():
             notes.append(f"{args.control}: {int(fit.rejected.sum())} points rejected by data snooping")
     return _Sensor(model, bare, kind, (line, sample), sigmas, fit, ellipsoid, notes)
+
+
+def _is_a_part(args: argparse.Namespace, image: SourceImage) -> bool:
+    """Whether an image with polynomials of its own is a part of the scene that they are of.
+
+    Raises
+    ------
+    UserError : a part of which nobody says whether they are of the scene or of the image
+    """
+    if args.first_pixel is None and (crop := image.crop()) is not None:
+        line, sample = crop
+        raise UserError(
+            f"{args.input}: a part of a scene by its geotransform, with RPC of its own: wanted --first-pixel {sample} "
+            f"{line} if these are of the whole scene, --first-pixel 0 0 if they are of the part"
+        )
+    return args.first_pixel is not None and any(args.first_pixel)
 
 
 def _first_pixel(

@@ -195,6 +195,25 @@ def test_a_part_of_a_scene_whose_rpc_state_no_size(scene, tmp_path):
     np.testing.assert_allclose(values[:, inner], there[:, inner], atol=0.02)
 
 
+def test_a_part_of_a_scene_with_the_polynomials_of_the_scene(scene, tmp_path, capsys):
+    """Programs that cut images out copy the tags as they are, and the part states no size of the scene."""
+    _, _, model, _, _, image = scene
+    rpc = fit_to_model(model, -100.0, 1100.0).rpc
+    with rasterio.open(image) as source:
+        bands = source.read()[:, 200:300, 60:240]
+    shift = rasterio.Affine(1.0, 0.0, 60.0, 0.0, 1.0, 200.0)
+    parts = write_image(tmp_path / "p.tif", bands, -1.0), write_image(tmp_path / "t.tif", bands, -1.0, shift)
+    for part, of_part in zip(parts, (rpc.shifted(200.0, 60.0), rpc), strict=True):
+        with rasterio.open(part, "r+") as target:
+            target.rpcs = as_gdal(of_part)
+    args = ("--height", 300, "--gsd", 10)
+    wanted = rectify(tmp_path, parts[0], parts[0], *args, name="w.tif")
+    found = rectify(tmp_path, parts[1], parts[1], *args, "--first-pixel", 60, 200, name="f.tif")
+    assert found.bounds == wanted.bounds and np.abs(found.read() - wanted.read()).max() < 0.01
+    error = refused(capsys, parts[1], "--sensor", parts[1], "-o", tmp_path / "o.tif", *args)
+    assert "wanted --first-pixel 60 200 if these are of the whole scene, --first-pixel 0 0 if" in error
+
+
 def test_direct_way_gives_the_same_orthoimage(scene, tmp_path):
     _, path, _, _, dem, image = scene
     args = ("--dem", dem, "--dem-datum", "ellipsoid", "--mask")
