@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +94,8 @@ class SourceImage:
         stated = np.array([np.inf if source.nodata is None else source.nodata])
         self._unstated = nodata is not None and not np.array_equal(stated, [nodata], equal_nan=True)
         self.descriptions = tuple(text or "" for text in source.descriptions)
+        self.scales, self.offsets = tuple(source.scales), tuple(source.offsets)
+        self.units = tuple(unit or "" for unit in source.units)
 
     def crop(self) -> tuple[int, int] | None:
         """Line and sample of the first pixel in the scene, where the geotransform tells it: no CRS, cells of 1."""
@@ -219,6 +221,8 @@ class ImageRectification:
             stack.enter_context(rasterio.Env(GDAL_CACHEMAX=CACHE_MB))
             words = (tags or {}, self.image.descriptions)
             raster = self._raster(self.image.bands, self.image.dtype.name, self.nodata, *words)
+            image = self.image
+            raster = replace(raster, scales=image.scales, offsets=image.offsets, units=image.units)
             target = stack.enter_context(tiled_orthoimage(output, raster, compress))
             classes = sigmas = None
             if mask is not None:

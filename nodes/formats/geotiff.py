@@ -128,6 +128,7 @@ class Raster:
     left, top, gsd : CRS coordinates of the upper left corner, and size of a cell
     rows, columns, bands, dtype, nodata : no data where nothing is written
     tags, descriptions : of the file, of its bands
+    scales, offsets, units : of the values of its bands; empty for values that are meant as they stand
     """
 
     crs: str | None
@@ -141,6 +142,9 @@ class Raster:
     nodata: float | None
     tags: dict[str, str] = field(default_factory=dict)
     descriptions: tuple[str, ...] = ()
+    scales: tuple[float, ...] = ()
+    offsets: tuple[float, ...] = ()
+    units: tuple[str, ...] = ()
 
 
 class Draft:
@@ -204,6 +208,10 @@ def tiled_orthoimage(
                 target.update_tags(**raster.tags)
                 for k, text in enumerate(raster.descriptions):
                     target.set_band_description(k + 1, text)
+                if any(scale != 1.0 for scale in raster.scales) or any(raster.offsets):
+                    target.scales, target.offsets = raster.scales, raster.offsets
+                if any(raster.units):
+                    target.units = raster.units
                 yield Draft(path, target)
             if compress == "plain":
                 draft.replace(part)

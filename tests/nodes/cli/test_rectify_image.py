@@ -272,6 +272,17 @@ def test_bands_of_different_types(scene, tmp_path, gsd):
     assert found.dtypes == ("float32", "float32") and np.abs(found.read() - wanted).max() < 0.01
 
 
+@pytest.mark.parametrize("more", [(), ("--plain",)])
+def test_what_grey_values_mean_goes_on(scene, tmp_path, more):
+    _, path, *_ = scene
+    image = write_image(tmp_path / "reflectance.tif", np.full((2, TRUTH.lines, TRUTH.samples), 4000, dtype=np.uint16))
+    with rasterio.open(image, "r+") as target:
+        target.scales, target.offsets, target.units = (1e-4, 2e-4), (-0.1, 0.0), ("reflectance", "1")
+    out = rectify(tmp_path, image, path, "--height", 100, *more)
+    assert out.scales == (1e-4, 2e-4) and out.offsets == (-0.1, 0.0) and out.units == ("reflectance", "1")
+    assert set(np.unique(out.read())) == {0, 4000}
+
+
 @pytest.mark.parametrize("stated", [7, None])
 def test_no_data_takes_no_part_where_pixels_are_put_together(scene, tmp_path, stated):
     """Whether the file states it or the command line does."""
