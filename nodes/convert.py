@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..schemas import messages as m
 from ..schemas.groups import grouped
-from ..solver.camera.line_camera import CcdLine, Lens, LineCamera
+from ..solver.camera.line_camera import CcdLine, Lens, LineCamera, quarter_turn
 from ..solver.camera.self_calibration import SELF_CALIBRATIONS, calibrated
 from ..solver.geometry.frames import LocalFrame
 from ..solver.geometry.rotation import (
@@ -330,6 +330,19 @@ def R_bc_of(project: Any) -> Array:
         return R_BC_NOMINAL
     roll, pitch, heading = np.radians(project.boresight_deg)
     return matrix_from_navigation(roll, pitch, heading) @ R_BC_NOMINAL
+
+
+def mounting_of(project: Any) -> tuple[int, Array]:
+    """How the camera is mounted: turned by so many quarters (0 to 3) from forward to the left, and what is left.
+
+    Returns
+    -------
+    turns
+    R_fi : (3, 3) the platform's axes forward-left-up from image axes that are turned by these quarters
+    """
+    R_fc = R_BC_NOMINAL.T @ R_bc_of(project)
+    turns = round(float(np.arctan2(R_fc[1, 0] - R_fc[0, 1], R_fc[0, 0] + R_fc[1, 1])) / (0.5 * np.pi)) % 4
+    return turns, R_fc @ quarter_turn(-turns)
 
 
 def lever_arm_of(project: Any) -> Array:

@@ -136,8 +136,7 @@ def _ccd(recording: Recording, camera: LineCamera, wanted: str | None) -> int:
         if wanted not in imaged:
             raise UserError(f"{path}: no image lines of CCD line {wanted!r}, there are: {', '.join(imaged)}")
         return camera.line_index[wanted]
-    forward = [abs(line.centre_mm[0] - camera.principal_point_mm[k][0]) for k, line in enumerate(camera.lines)]
-    return min((camera.line_index[id] for id in imaged), key=lambda k: forward[k])
+    return min((camera.line_index[id] for id in imaged), key=lambda k: abs(float(camera.ahead_mm[k])))
 
 
 def check_strips(recording: Recording, wanted: list[str] | None) -> None:

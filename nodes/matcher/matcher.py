@@ -10,6 +10,7 @@ import numpy as np
 from ...schemas import messages as m
 from ...schemas.image_lines import LineBlock
 from ...schemas.topics import CONFIGURATION, POSES, find
+from ...solver.geometry.rotation import quaternion_multiply
 from ...solver.matching.line_times import LineTimes
 from ...solver.matching.options import MatchedTie, MatchingOptions
 from ...solver.matching.round_earth import above_sphere
@@ -35,6 +36,9 @@ FAILED = ("too few looks", "looks never came", "contradiction", "ground not foun
 LOWEST_GROUND_M = -450.0
 #: Platform time between two words on how far the matcher is, ns.
 PROGRESS_NS = 40_000_000
+
+#: Quaternions that turn about z by no, one, two and three quarters of a turn, from y to x.
+_BACK = np.array([(0.0, 0.0, -np.sin(a), np.cos(a)) for a in 0.25 * np.pi * np.arange(4)])
 
 #: Topics that follow from what the matcher says: they tell nothing of time, and when one comes depends on how a flight
 #: ends.
@@ -115,6 +119,7 @@ class Matcher(Node):
         self._refused: set[str] = set()  # of which an operator said that they do not count
         self._frame_of: Any = None  # the project whose local frame poses and control are in
         self._origin_m = 0.0  # height of the local frame's origin
+        self._mounting = 0, np.eye(3)  # of the camera, as `convert.mounting_of` tells it
         self._failed = 0  # places of the strip that came to nothing; -1 once a tie is found or it has been told
         self._ground_unknown = False  # when they were counted
         self._delay_ns = round(delay_s * convert.SECOND_NS)
@@ -222,14 +227,16 @@ class Matcher(Node):
 
     def _project_came(self, body: Any, stamp_ns: int) -> list[Message]:
         another_frame = self._frame_of is not None and not convert.same_frame(body, self._frame_of)
+        mounted, self._mounting = self._mounting, convert.mounting_of(body)
         self._frame_of = body
         if np.isfinite(body.origin_height) and body.origin_height != self._origin_m:
             self._origin_m = float(body.origin_height)
             self._set_ground()
-        if not another_frame:
+        if another_frame:
+            self._heights.clear()  # they have to be stated again in the new frame, and poses so far are not in it
+            self._targets.forget()
+        elif self._mounting[0] == mounted[0]:
             return []
-        self._heights.clear()  # they have to be stated again in the new frame, and poses so far are not in it
-        self._targets.forget()
         return [] if self._camera is None else self._begin(self._camera, stamp_ns)
 
     def _configure(self, body: Any, stamp_ns: int) -> list[Message]:
@@ -238,13 +245,15 @@ class Matcher(Node):
     def _begin(self, body: Any, stamp_ns: int) -> list[Message]:
         """Begin, or begin again, with a camera."""
         again = self._matcher is not None
-        camera = convert.camera_from(body)
+        # matching wants the x axis to go along the flight; of omega, phi and kappa the turn changes kappa alone
+        turns, R_fi = self._mounting
+        camera = convert.camera_from(body).turned(turns)
         self._camera, self._matcher = body, None
         self._reference_ns = stamp_ns // convert.SECOND_NS * convert.SECOND_NS
         self._times.clear()
         # lines of one lens see the ground in the same strip; several lenses, or one line, in one strip after another
         in_strip = len(camera.lenses) == 1 and len(camera.lines) > 1
-        self._matcher = TieMatcher(camera, self.options) if in_strip else StripMatcher(camera, self.options)
+        self._matcher = TieMatcher(camera, self.options, R_fi) if in_strip else StripMatcher(camera, self.options)
         self._matcher.keep(self._pace.share)
         self._set_ground()
         self._targets.configure(camera, self._matcher.orientation)
@@ -315,7 +324,8 @@ class Matcher(Node):
         if sample.covariance is None:
             raise ValueError("pose without covariance")
         time_s = (sample.time_ns - self._reference_ns) * 1e-9
-        if not self._matcher.add_pose(time_s, sample.position_l, sample.quaternion, sample.covariance):
+        quaternion = quaternion_multiply(sample.quaternion, _BACK[self._mounting[0]])
+        if not self._matcher.add_pose(time_s, sample.position_l, quaternion, sample.covariance):
             self.problem("pose out of order", f"pose of {time_s:.3f} s came twice or too late")
 
     def _correction(self, body: Any) -> None:

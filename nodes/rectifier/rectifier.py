@@ -235,8 +235,7 @@ class Rectifier(Node):
                 raise ValueError(f"ccd: the camera has no line {self._ccd!r}")
             self._line = camera.line_index[self._ccd]
         else:
-            ahead = [line.centre_mm[0] - p[0] for line, p in zip(camera.lines, camera.principal_point_mm, strict=True)]
-            self._line = int(np.argmin(np.abs(ahead)))
+            self._line = camera.line_index[camera.nadir_line.id]
         self._factor = -(-camera.lines[self._line].pixels // self._samples)
 
     def _reduced(self, lines: WaitingLines) -> None:

@@ -86,8 +86,16 @@ class LineCamera:
 
     @cached_property
     def nadir_line(self) -> CcdLine:
-        """The line that looks down: its middle is nearest to the origin along the track."""
-        return min(self.lines, key=lambda line: abs(float(line.centre_mm[0])))
+        """The line that looks down: its middle is nearest to the principal point along the track."""
+        return self.lines[int(np.argmin(np.abs(self.ahead_mm)))]
+
+    @cached_property
+    def ahead_mm(self) -> Array:
+        """(lines,) how far the middle of each line is from the principal point along the track: at right angles to the
+        lines, which run along y or, where the image axes are mounted a quarter of a turn off, along x."""
+        way = np.abs([line.xy_mm[-1] - line.xy_mm[0] for line in self.lines]).sum(axis=0)
+        axis = int(way[0] > way[1])
+        return np.array([line.centre_mm[axis] for line in self.lines]) - self.principal_point_mm[:, axis]
 
     @cached_property
     def lens_of_line(self) -> NDArray[np.int_]:
@@ -122,12 +130,30 @@ class LineCamera:
         pitch = xy_mm[of_pixel + 1] - begin
         return begin + (v - i)[:, None] * pitch - self.principal_point_mm[line], pitch
 
+    def turned(self, quarters: int) -> LineCamera:
+        """The camera turned about z by so many quarters of a turn, from x to y; itself for none."""
+        if quarters % 4 == 0:
+            return self
+        R = quarter_turn(quarters)[:2, :2]
+        lenses = []
+        for lens in self.lenses:
+            x, y = (R @ lens.principal_point_mm).tolist()
+            lenses.append(Lens(lens.id, lens.focal_length_mm, (x, y)))
+        lines = tuple(CcdLine(line.id, line.lens, line.xy_mm @ R.T, line.chips) for line in self.lines)
+        return LineCamera(self.name, tuple(lenses), lines)
+
     @cached_property
     def _pixels(self) -> tuple[Array, NDArray[np.int_], NDArray[np.int_]]:
         """Pixel centres of all lines one after the other (k, 2), where each line begins there, and the last pixel but
         one of each (lines,)."""
         count = np.array([line.pixels for line in self.lines], dtype=int)
         return np.concatenate([line.xy_mm for line in self.lines]), np.cumsum(count) - count, count - 2
+
+
+def quarter_turn(quarters: int) -> Array:
+    """Rotation (3, 3) about z by so many quarters of a turn, from x to y; its numbers are whole."""
+    cosine, sine = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[quarters % 4]
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
 def finest_pixel(camera: LineCamera) -> float:

@@ -21,7 +21,7 @@ class View:
     ccd : its name
     focal_length_mm : camera constant of its lens
     y_mm, x_mm, sample : (pixels,) increasing in y
-    forward : tangent of the angle by which its middle looks forward
+    forward : tangent of the angle by which its middle looks forward when the platform flies level
     """
 
     ccd: str
@@ -48,8 +48,12 @@ class View:
         )
 
 
-def view_of(camera: LineCamera, line: int) -> View:
+def view_of(camera: LineCamera, line: int, R_fi: Array | None = None) -> View:
     """A CCD line of a camera as a view.
+
+    Parameters
+    ----------
+    R_fi : (3, 3) the platform's axes forward-left-up from the image axes, of a camera that does not look straight down
 
     Raises
     ------
@@ -63,7 +67,8 @@ def view_of(camera: LineCamera, line: int) -> View:
     if not (np.diff(xy[:, 1]) > 0).all():
         raise ValueError(f"CCD line {camera.lines[line].id!r} must run across the flight for matching")
     c = float(camera.focal_length_mm[line])
-    return View(camera.lines[line].id, c, xy[:, 1], xy[:, 0], sample, float(xy[pixels // 2, 0]) / c)
+    ray = (np.eye(3) if R_fi is None else R_fi) @ np.append(xy[pixels // 2], -c)
+    return View(camera.lines[line].id, c, xy[:, 1], xy[:, 0], sample, float(ray[0] / -ray[2]))
 
 
 @dataclass(frozen=True)

@@ -35,19 +35,20 @@ class TieMatcher:
     ----------
     camera : line camera with at least two lines across the flight
     options : see `MatchingOptions`
+    R_fi : (3, 3) the platform's axes forward-left-up from the image axes; where the camera looks when it flies level
 
     Attributes
     ----------
     counters : places by what became of them, lines by what was wrong with them
     """
 
-    def __init__(self, camera: LineCamera, options: MatchingOptions | None = None):
+    def __init__(self, camera: LineCamera, options: MatchingOptions | None = None, R_fi: Array | None = None):
         self.options = o = options or MatchingOptions()
         if len(camera.lines) < 2:
             raise ValueError("matching wants a camera with at least two CCD lines")
         if len(camera.lenses) != 1:
             raise ValueError(f"matching wants a camera with one lens, {camera.name} has {len(camera.lenses)}")
-        self.views = [view_of(camera, i) for i in range(len(camera.lines))]
+        self.views = [view_of(camera, i, R_fi) for i in range(len(camera.lines))]
         self.counters: Counter[str] = Counter()
         self.chips = ChipStore(int(o.chips_mb * 1e6))
         self._lines = LineIntake({v.ccd: v.pixels for v in self.views}, o, self._make_store)

@@ -91,7 +91,6 @@ class Arrivals:
 
 def look_time(camera: LineCamera, batch: Batch) -> float:
     """Time between the first and the last look at a point, s, from view angles, height and speed."""
-    tangent = camera.principal_point_mm[:, 0] - np.array([line.centre_mm[0] for line in camera.lines])
     height = float(np.median(batch.rays.position_l[:, 2] - batch.points_l[batch.rays.point, 2]))
     speed = float(np.median(np.linalg.norm(batch.rays.velocity_l, axis=1)))
-    return float(np.ptp(tangent / camera.focal_length_mm)) * height / max(speed, 1.0)
+    return float(np.ptp(camera.ahead_mm / camera.focal_length_mm)) * height / max(speed, 1.0)

@@ -7,7 +7,7 @@ import pytest
 from recording_file import write_recording
 
 from triline.nodes.adjuster.adjuster import Adjuster
-from triline.nodes.convert import local_frame
+from triline.nodes.convert import R_bc_of, local_frame, pose_sample
 from triline.nodes.matcher.matcher import Matcher
 from triline.nodes.navigator.navigator import Navigator
 from triline.nodes.node import Message
@@ -18,6 +18,7 @@ from triline.nodes.simulator.flight_settings import simulated_flight
 from triline.nodes.simulator.simulator import Simulator
 from triline.schemas import messages as m
 from triline.schemas.image_lines import LineBlock
+from triline.solver.geometry.rotation import R_BC_NOMINAL, matrix_from_quaternion
 from triline.solver.matching.options import MatchingOptions
 from triline.solver.matching.places import Density
 
@@ -367,3 +368,47 @@ def test_in_another_local_frame_matching_begins_again(tmp_path, low):
     assert "configuration changed: matching starts again" in told
     assert not [text for text in told if "poor likeness" in text or "at the end of the line" in text], told
     assert sum(not tie.point.startswith("S1-M") for tie in ties) > 10 and counted["target measured"] > 60
+
+
+def _mounted(messages, boresight_deg):
+    """The same flight with a camera whose image axes are mounted with a boresight: it sees what it saw."""
+    for x in messages:
+        if x.topic not in ("configuration/project", "configuration/camera"):
+            yield x
+            continue
+        body = type(x.body).FromString(x.body.SerializeToString())
+        if x.topic == "configuration/project":
+            body.boresight_deg[:] = boresight_deg
+        else:
+            R_bc = R_bc_of(m.Project(boresight_deg=boresight_deg))
+            c = body.lenses[0].focal_length_mm
+            for line in body.lines:
+                v = np.stack([line.x_mm, line.y_mm, np.full(len(line.x_mm), -c)], axis=1) @ R_BC_NOMINAL.T @ R_bc
+                line.x_mm[:], line.y_mm[:] = (-c * v[:, :2] / v[:, 2:]).T.tolist()
+        yield replace(x, body=body)
+
+
+def _whole(out):
+    """Perspective centres and third axes of the camera, of the last answers."""
+    poses = [pose_sample(x.body) for x in RecordingReader(out).messages(["orientation/whole"])]
+    axis = [matrix_from_quaternion(pose.quaternion)[:, 2] for pose in poses]
+    return np.array([pose.position_l for pose in poses]), np.array(axis)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory, messages):
+    folder = tmp_path_factory.mktemp("plain")
+    _, ties, _ = run(folder, messages)
+    return len(ties), *_whole(folder / "out.mcap")
+
+
+@pytest.mark.parametrize("boresight_deg", [(0.0, 0.0, 90.0), (0.0, 0.0, 180.0), (5.0, 25.0, 0.0)])
+def test_a_camera_may_be_mounted_turned_or_oblique(tmp_path, messages, plain, boresight_deg):
+    number, centre, axis = plain
+    summary, ties, _ = run(tmp_path, _mounted(messages, boresight_deg))
+    assert not summary.counters["matcher"].get("malformed") and not summary.counters["adjuster"].get("malformed")
+    assert len(ties) > 0.85 * number > 30
+    found, turned = _whole(tmp_path / "out.mcap")
+    assert len(found) == len(centre) and np.abs(found - centre).max() < 0.3
+    if boresight_deg[0] == 0.0:  # else the camera's axes are others
+        assert np.abs(turned - axis).max() < 5e-4
