@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from envi_files import write_camera
 from triline.nodes.errors import UserError
 from triline.nodes.formats.camera_json import read_camera
 from triline.nodes.formats.keys import Keys
-from triline.nodes.sensors.line_camera import LineCameraSettings, LineFiles
+from triline.nodes.sensors.line_camera import GrowingTimes, LineCameraSettings, LineFiles
 
 T = 1_795_339_670_000_000_000
 START = "2026-11-22T09:27:50Z"
@@ -81,6 +82,18 @@ def test_a_raw_file_with_its_own_line_times(tmp_path):
     np.testing.assert_array_equal(np.concatenate([m.body.pixels for m in blocks]), IMAGE[:20, 0])
     np.testing.assert_array_equal(np.concatenate([m.body.times_ns() for m in blocks]), times - 500_000_000)
     assert strip.body.first_line_time_ns == times[0] - 500_000_000
+
+
+def test_line_times_in_words_come_as_fast_as_lines(tmp_path):
+    """A millisecond for each was a whole processor at 1000 lines a second, and a minute after a minute's strip."""
+    times = T + np.arange(4000, dtype=np.int64) * 1_000_123
+    words = np.datetime_as_string(times.astype("datetime64[ns]"))
+    (tmp_path / "times.csv").write_text("line,time\n" + "".join(f"{i},{w}Z\n" for i, w in enumerate(words)))
+    read_in = GrowingTimes(tmp_path / "times.csv")
+    begun = time.process_time()
+    read_in.read()
+    assert time.process_time() - begun < 1.0
+    np.testing.assert_array_equal(read_in.time_ns, times)
 
 
 def test_a_second_band_of_a_raw_file_is_refused(tmp_path):
