@@ -7,7 +7,7 @@ import pytest
 from recording_file import write_recording
 
 from triline.nodes.adjuster.adjuster import Adjuster
-from triline.nodes.convert import R_bc_of, local_frame, pose_sample
+from triline.nodes.convert import R_bc_of, local_frame, mounting_of, pose_sample
 from triline.nodes.matcher.matcher import Matcher
 from triline.nodes.navigator.navigator import Navigator
 from triline.nodes.node import Message
@@ -18,7 +18,8 @@ from triline.nodes.simulator.flight_settings import simulated_flight
 from triline.nodes.simulator.simulator import Simulator
 from triline.schemas import messages as m
 from triline.schemas.image_lines import LineBlock
-from triline.solver.geometry.rotation import R_BC_NOMINAL, matrix_from_quaternion
+from triline.solver.camera.line_camera import quarter_turn
+from triline.solver.geometry.rotation import R_BC_NOMINAL
 from triline.solver.matching.options import MatchingOptions
 from triline.solver.matching.places import Density
 
@@ -389,26 +390,34 @@ def _mounted(messages, boresight_deg):
 
 
 def _whole(out):
-    """Perspective centres and third axes of the camera, of the last answers."""
+    """Perspective centres of the last answers."""
     poses = [pose_sample(x.body) for x in RecordingReader(out).messages(["orientation/whole"])]
-    axis = [matrix_from_quaternion(pose.quaternion)[:, 2] for pose in poses]
-    return np.array([pose.position_l for pose in poses]), np.array(axis)
+    return np.array([pose.position_l for pose in poses])
 
 
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory, messages):
-    folder = tmp_path_factory.mktemp("plain")
-    _, ties, _ = run(folder, messages)
-    return len(ties), *_whole(folder / "out.mcap")
+@pytest.mark.parametrize(
+    ("heading_deg", "turns"), [(0.0, 0), (44.0, 0), (-46.0, 1), (-90.0, 1), (180.0, 2), (90.0, 3), (134.0, 3)]
+)
+def test_a_mounting_is_quarters_of_a_turn_and_what_is_left(heading_deg, turns):
+    project = m.Project(boresight_deg=(4.0, -3.0, heading_deg))
+    found, R_fi = mounting_of(project)
+    R_fc = R_BC_NOMINAL.T @ R_bc_of(project)
+    ray = np.array([3.0, 1.0, -60.0])  # in image axes
+    x, y = quarter_turn(found)[:2, :2] @ ray[:2]
+    assert found == turns
+    assert R_fi @ (x, y, ray[2]) == pytest.approx(R_fc @ ray)
+    assert R_fi[0, 0] > 0.65  # x goes along the flight
 
 
-@pytest.mark.parametrize("boresight_deg", [(0.0, 0.0, 90.0), (0.0, 0.0, 180.0), (5.0, 25.0, 0.0)])
-def test_a_camera_may_be_mounted_turned_or_oblique(tmp_path, messages, plain, boresight_deg):
-    number, centre, axis = plain
-    summary, ties, _ = run(tmp_path, _mounted(messages, boresight_deg))
-    assert not summary.counters["matcher"].get("malformed") and not summary.counters["adjuster"].get("malformed")
-    assert len(ties) > 0.85 * number > 30
-    found, turned = _whole(tmp_path / "out.mcap")
-    assert len(found) == len(centre) and np.abs(found - centre).max() < 0.3
-    if boresight_deg[0] == 0.0:  # else the camera's axes are others
-        assert np.abs(turned - axis).max() < 5e-4
+def test_a_camera_may_be_mounted_turned_and_oblique(tmp_path, messages):
+    """The whole orientation is that of the same flight with a camera that is mounted straight."""
+    flown = {}
+    for name, sees in (("straight", messages), ("turned", _mounted(messages, (5.0, 25.0, 90.0)))):
+        folder = tmp_path / name
+        folder.mkdir()
+        summary, ties, _ = run(folder, sees)
+        assert not summary.counters["matcher"].get("malformed") and not summary.counters["adjuster"].get("malformed")
+        flown[name] = len(ties), _whole(folder / "out.mcap")
+    (number, expected), (found_number, found) = flown.values()
+    assert found_number > 0.85 * number > 30
+    assert len(found) == len(expected) and np.abs(found - expected).max() < 0.3
