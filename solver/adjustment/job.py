@@ -517,7 +517,9 @@ class _Stage:
 
     def _snoop(self) -> None:
         self.tell(Phase("data snooping"))
-        self.snooping = snoop(self.solution, self.job.critical, self.job.on_the_way, self.tell, self.snooping)
+        self.snooping = snoop(
+            self.solution, self.job.critical, self.job.on_the_way, self.tell, self.snooping, self.scales.factor["image"]
+        )
         self._keep(self.snooping.solution)
         self.given = self.solution.ray_weight
 

@@ -203,6 +203,15 @@ class Network:
     def rays_per_point(self) -> IntArray:
         return np.diff(self.first_ray)
 
+    def where_rays_meet(self, points: IntArray) -> Array:
+        """Intersection (m, 3) of the measured rays of some points (m,), each named once, without what is given of them;
+        the approximate place of a point that its rays do not determine."""
+        place = np.full(self.n_points, -1)
+        place[points] = np.arange(len(points))
+        rays = self.rays.part(np.flatnonzero(place[self.rays.point] >= 0))
+        met, known = intersect_rays(rays.position_l, _directions(rays), place[rays.point], len(points))
+        return np.where(known[:, None], met, self.approximate_l[points])
+
     @cached_property
     def point_index(self) -> dict[str, int]:
         return {id: i for i, id in enumerate(self.point_ids)}

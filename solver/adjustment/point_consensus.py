@@ -17,7 +17,7 @@ import numpy as np
 from ..arrays import Array, Bools, IntArray
 from ..quantiles import chi2
 from .adjustment import Solution
-from .linearisation import linearise
+from .linearisation import linearise, linearise_and_weigh
 
 Places = IntArray
 
@@ -183,8 +183,8 @@ def _joint(v: Array, AQA: Array, inside: Bools) -> Array:
     return squares / ORIENTATION_SHARE**2
 
 
-def consensus_of_points(solution: Solution, points: Places, limit: float) -> dict[int, tuple[Places, bool]]:
-    """Rays (places in the network) that agree best, and whether there is a rival, for each of some points.
+def consensus_of_points(solution: Solution, points: Places, limit: float) -> dict[int, tuple[Places, bool, Array]]:
+    """Rays (places in the network) that agree best, whether there is a rival, and where they meet (3,), of some points.
 
     Points of which no two rays agree are absent.
     """
@@ -194,9 +194,17 @@ def consensus_of_points(solution: Solution, points: Places, limit: float) -> dic
         return {}
     network, state = solution.network, solution.state
     place, lin = state.points_l.copy(), solution.linearisation
-    found: dict[int, tuple[Places, bool]] = {}
+    # one that its rays have left is where it is given, which may be far from where they meet, and so are their weights
+    given = np.intersect1d(points, network.control.point)
+    place[given] = network.where_rays_meet(given)
+    found: dict[int, tuple[Places, bool, Array]] = {}
     for number in range(PASSES):
-        if number:
+        if len(given):
+            fresh = linearise_and_weigh(network.rays, solution.layout, state.theta, place)
+            # what the sigmas of the image were multiplied by is in the weights alone
+            factor = float(np.median(solution.whitening.g[0] / fresh.whitening.g[0]))
+            lin = fresh.linearisation.reweighted(np.full(len(network.rays), factor**2))
+        elif number:
             lin = linearise(network.rays, solution.layout, solution.whitening, state.theta, place)
         found = {}
         for own in _alike(points, network.rays_per_point):
@@ -206,7 +214,7 @@ def consensus_of_points(solution: Solution, points: Places, limit: float) -> dic
             )
             place[own] += best.shift_m
             for i in np.flatnonzero(best.found).tolist():
-                found[int(own[i])] = rays[i, best.chosen[i]], bool(best.rival[i])
+                found[int(own[i])] = rays[i, best.chosen[i]], bool(best.rival[i]), place[own[i]].copy()
     return {p: found[p] for p in points.tolist() if p in found}
 
 

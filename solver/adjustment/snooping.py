@@ -4,6 +4,8 @@ Several observations go in one round only where they cannot have caused each oth
 point, and none that is much smaller than the largest of all. What was left out is tested against the adjustment without
 it and returns if it agrees: an outlier that was masked, or that made good neighbours look bad, is undone that way.
 Where a point has lost half of its rays, the largest set of its rays that agree takes the place of those that were kept.
+Given coordinates of the point that contradict this set go in place of its rays: one that is grossly wrong bends the
+block so much that the rays of its own point fail first.
 
 The test takes model and a-priori sigmas for right. Where most image points fail they are not, and nothing is left out.
 Control is what the block stands on: a coordinate goes only if it fails clearly while the image points fit.
@@ -19,12 +21,13 @@ import numpy as np
 
 from ..arrays import Array, IntArray
 from ..quantiles import chi2, norm
-from .adjustment import AdjustmentOptions, Solution, solve
+from .adjustment import AdjustmentOptions, Solution, State, solve
 from .covariance import Cofactors, cofactors
 from .normal_equations import weigh_control
 from .point_consensus import consensus_of_points
 from .ray_statistics import RayStatistics, ray_statistics
 from .reliability import CRITICAL_W
+from .variance_components import scaled
 
 #: A failing observation goes in the same round as the largest only if it has at least this share of it.
 TOGETHER = 0.5
@@ -35,6 +38,10 @@ MOST_LEFT_OUT = 0.35
 #: A control coordinate goes beyond so many times the critical value, and only if the sigma of the image points, from
 #: the median of their w, is less than so many times the a-priori one.
 CONTROL_CLEAR, CONTROL_FIT = 2.0, 1.5
+
+#: The image motion is taken anew for the weights where the cost has fallen below this share of what it was when that
+#: was done last: gross errors bend a block, and the weights with it.
+WEIGHTS_ANEW = 0.9
 
 #: Rounds after which the search ends in any case; blocks with a few per cent of outliers take ten.
 MOST_ROUNDS = 100
@@ -120,6 +127,7 @@ def snoop(
     options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008  (frozen)
     progress: Callable[[Round], None] | None = None,
     before: Snooping | None = None,
+    image_factor: float = 1.0,
 ) -> Snooping:
     """Leave out image points and control coordinates whose normalised residual exceeds the critical value.
 
@@ -134,10 +142,11 @@ def snoop(
     progress : called after every round
     before : search in an earlier adjustment of the same network, from which `solution` has its weights: what it left
         out is reported again, and may return
+    image_factor : what the sigmas of the image points were multiplied by, which weights that are taken anew need
     """
     if not critical > 0:
         raise ValueError(f"critical value {critical}, wanted more than 0")
-    search = _Search(solution, critical, before)
+    search = _Search(solution, critical, before, image_factor)
     beginning = search.result(0)
     for number in range(1, MOST_ROUNDS + 1):
         largest, out = search.leave_out()
@@ -171,8 +180,8 @@ def _weight_of_all_control(solution: Solution) -> Array:
 class _Search:
     """The state of a search: weights of rays and control, and what was left out when."""
 
-    def __init__(self, solution: Solution, critical: float, before: Snooping | None):
-        self.critical = critical
+    def __init__(self, solution: Solution, critical: float, before: Snooping | None, image_factor: float):
+        self.critical, self.image_factor = critical, image_factor
         self.point = solution.network.rays.point
         self.weight = solution.ray_weight.copy()
         self.control_weight = solution.problem.control.weight.copy()
@@ -187,6 +196,8 @@ class _Search:
             elif r.reason == "snooping":
                 self.control_out[r.point, r.axis] = r.w
         self.out_before = len(self.out)
+        self.weighed_at = solution.cost
+        self.start: State | None = None
         self._take(solution)
 
     def _take(self, solution: Solution) -> None:
@@ -201,7 +212,17 @@ class _Search:
             control = replace(control, weight=self.control_weight.copy())
             problem = replace(self.solution.problem, control=control)
             self.solution = replace(self.solution, problem=problem)
-        self._take(solve(self.solution.problem, self.solution, self.weight, options))
+        found = self.solution
+        if self.start is None:
+            found = solve(found.problem, found, self.weight, options)
+            if found.cost < WEIGHTS_ANEW * self.weighed_at:
+                self.start = found.state
+        if self.start is not None:
+            found = solve(found.problem, self.start, self.weight, options)
+            if self.image_factor != 1.0:
+                found = scaled(found, {"image": self.image_factor}, options)
+            self.weighed_at, self.start = found.cost, None
+        self._take(found)
 
     def leave_out(self) -> tuple[float, int]:
         """Largest |w| of what takes part, and how many observations go."""
@@ -238,21 +259,25 @@ class _Search:
         return self._bring_back_rays() or self._bring_back_control()
 
     def _bring_back_control(self) -> int:
-        points, control = self.cofactors.points, self.solution.problem.control
-        known = self.solution.points.rank == 3
         back = []
         for key in self.control_out:
-            i, a = key
-            sigma2 = 1.0 / self.given_weight[key]
-            miss = self.solution.state.points_l[key] - control.xyz_l[key]
-            agrees = known[i] and miss**2 <= self.critical**2 * (sigma2 + points[i, a, a])
-            if agrees and key not in self.returned:
+            w = self._w_of_control_out(key)
+            if w is not None and abs(w) <= self.critical and key not in self.returned:
                 back.append(key)
         for key in back:
             del self.control_out[key]
             self.returned.add(key)
             self.control_weight[key] = self.given_weight[key]
         return len(back)
+
+    def _w_of_control_out(self, key: tuple[int, int]) -> float | None:
+        """Normalised difference, adjusted minus given, of a coordinate that was left out; None where its point is not
+        determined without it."""
+        i, a = key
+        if self.solution.points.rank[i] < 3:
+            return None
+        miss = self.solution.state.points_l[key] - self.solution.problem.control.xyz_l[key]
+        return float(miss / np.sqrt(1.0 / self.given_weight[key] + self.cofactors.points[i, a, a]))
 
     def _bring_back_rays(self) -> int:
         candidates = np.array([i for i in self.out if i not in self.returned], dtype=np.int64)
@@ -270,15 +295,17 @@ class _Search:
         return len(first)
 
     def exchange(self) -> int:
-        """Where half of a point's rays are out and more of them agree than were kept, these take their place."""
+        """Where half of a point's rays are out and more of them agree than were kept, these take their place.
+
+        Coordinates that are given of the point go then; those that agree with its rays return.
+        """
         n = self.solution.network.n_points
         lost = np.bincount(self.point[list(self.out)], minlength=n) if self.out else np.zeros(n, dtype=np.int64)
         mostly = (lost > 0) & (2 * lost >= np.bincount(self.point, minlength=n))
-        mostly[self.solution.network.control.point] = False
         points = np.array([p for p in np.flatnonzero(mostly) if int(p) not in self.exchanged], dtype=np.int64)
         self.exchanged.update(points.tolist())
         back = 0
-        for p, (chosen, rival) in consensus_of_points(self.solution, points, joint_limit(self.critical)).items():
+        for p, (chosen, rival, place) in consensus_of_points(self.solution, points, joint_limit(self.critical)).items():
             own = np.flatnonzero(self.point == p)
             kept = own[self.weight[own] > 0]
             if rival or len(chosen) < 3 or len(chosen) <= len(kept):
@@ -291,6 +318,15 @@ class _Search:
                 else:
                     self.out.setdefault(int(i), 0.0)
                 self.weight[i] = float(inside)
+            given = np.flatnonzero(self.control_weight[p] > 0)
+            for axis in given:
+                self.control_out[p, int(axis)] = float(self.control_w[p, axis])
+                self.control_weight[p, axis] = 0.0
+            if len(given):  # it begins where its rays meet
+                start = self.start or self.solution.state
+                points = start.points_l.copy()
+                points[p] = place
+                self.start = State(start.theta, points)
         return back
 
     @property
@@ -307,6 +343,8 @@ class _Search:
         p = self.point
         lone = np.flatnonzero((self.weight > 0) & (rank[p] < 3) & np.isin(p, [p[i] for i in self.out]))
         rejected += [Rejected(int(i), -1, -1, 0.0, "lone") for i in lone]
-        rejected += [Rejected(-1, i, a, w, "snooping") for (i, a), w in self.control_out.items()]
+        for (i, a), w in self.control_out.items():
+            now = self._w_of_control_out((i, a))
+            rejected.append(Rejected(-1, i, a, w if now is None else now, "snooping"))
         rejected.sort(key=lambda r: -abs(r.w))
         return Snooping(self.solution, self.cofactors, self.statistics, tuple(rejected), rounds)

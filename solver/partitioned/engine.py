@@ -191,8 +191,8 @@ class Engine:
             return version, own[key] - self._points[key], limit
 
         for key, found in zip(keys, self.runner.each(tasks.consensus, keys, wanted), strict=True):
-            for point, (rays, rival) in found.items():
-                result[int(point + self._points[key])] = rays + self._rays[key], rival
+            for point, (rays, rival, place) in found.items():
+                result[int(point + self._points[key])] = rays + self._rays[key], rival, place
         return result
 
     def with_noise_left(self, solution: Solution) -> bool:

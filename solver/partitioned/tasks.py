@@ -350,7 +350,9 @@ def points(store: Store, key: int, read: int) -> Points:
     return Points(equations.at.state.points_l, equations.points.rank, equations.weight)
 
 
-def consensus(store: Store, key: int, read: int, places: IntArray, limit: float) -> dict[int, tuple[IntArray, bool]]:
+def consensus(
+    store: Store, key: int, read: int, places: IntArray, limit: float
+) -> dict[int, tuple[IntArray, bool, Array]]:
     """`consensus_of_points` of some points of a partition."""
     _, equations = _load(store, key, read)
     none = Blocks(np.empty((0, 0)), np.empty(0))

@@ -219,6 +219,43 @@ def test_blunder_in_a_control_point_is_found_there_and_not_in_its_rays():
     assert outcome.solution.sigma0 == pytest.approx(1.0, abs=0.08)
 
 
+@pytest.mark.parametrize(("axis", "off_m"), [(0, 20.0), (1, 500.0), (2, 100.0), (2, 5000.0)])
+def test_control_that_is_grossly_wrong_goes_in_place_of_the_rays_of_its_point(axis, off_m):
+    """It bends the block so much that its rays fail first: with all of them out nothing contradicted it any more."""
+    clean = block(4).network
+    xyz = clean.control.xyz_l.copy()
+    xyz[2, axis] += off_m
+    network = replace(clean, control=Control(clean.control.point, xyz, clean.control.sigma_m))
+    outcome = snoop(adjust(network, MODEL))
+    point = int(network.control.point[2])
+    [(blamed, w)] = [((r.point, r.axis), r.w) for r in outcome.rejected if r.ray < 0]
+    assert blamed == (point, axis)
+    sigma = np.hypot(clean.control.sigma_m[2, axis], np.sqrt(outcome.cofactors.points[point, axis, axis]))
+    assert w == pytest.approx(-off_m / sigma, rel=0.02)
+    assert not any(network.rays.point[r.ray] == point for r in outcome.rejected if r.ray >= 0)
+    without = np.array(clean.control.sigma_m)
+    without[2, axis] = np.inf
+    by_hand = snoop(adjust(replace(clean, control=Control(clean.control.point, clean.control.xyz_l, without)), MODEL))
+    assert outcome.solution.sigma0 == pytest.approx(by_hand.solution.sigma0, rel=1e-4)
+    np.testing.assert_allclose(outcome.solution.state.points_l, by_hand.solution.state.points_l, atol=2e-4)
+
+
+def test_looks_at_other_points_leave_no_trace_in_the_weights():
+    """Wrong names move looks by thousands of pixels; weights of the block that they bend are not those without them."""
+    clean = block(6).network
+    line, sample = clean.rays.line.copy(), clean.rays.sample.copy()
+    bad = np.arange(5, len(line), len(line) // 8)
+    line[bad], sample[bad] = np.roll(line[bad], 1), np.roll(sample[bad], 1)
+    network = rebuilt(clean, line, sample)
+    moved = np.isin(network.rays.source, bad)
+    outcome = snoop(adjust(network, MODEL))
+    out = rejected_rays(network, outcome.rejected)
+    assert out[moved].all() and (out & ~moved).sum() <= 1
+    by_hand = solve(outcome.solution.problem, None, (~out).astype(float))
+    assert outcome.solution.sigma0 == pytest.approx(by_hand.sigma0, rel=1e-4)
+    np.testing.assert_allclose(outcome.solution.whitening.g, by_hand.whitening.g, rtol=1e-3, atol=1e-9)
+
+
 def wandering(seed):
     """A block whose trajectories have slow errors that DGR cannot follow."""
     rng = np.random.default_rng(seed)
