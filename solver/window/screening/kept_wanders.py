@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...arrays import Array
+from ...arrays import Array, IntArray
 
 #: The other wander was meant where its factor has become so many times as large since. Tuned.
 MOVED = 2.0
@@ -25,7 +25,7 @@ class KeptWanders:
         self._largest, self._other_then = np.ones(2), np.ones(2)
         self._equations_then, self._first_s = np.zeros(2), np.full(2, np.inf)
 
-    def keeps(self, factor: Array, equations: Array, final_to_s: float) -> tuple[bool, bool]:
+    def keeps(self, factor: Array, equations: IntArray, final_to_s: float) -> tuple[bool, bool]:
         """Whether what is present keeps its largest factors.
 
         Not where the other wander has become much larger since: then it was that one all along. Nor where the same data
