@@ -22,6 +22,8 @@ from ..node import Message
 
 #: Time between strips whose times overlap in the files, after they are shifted, s.
 GAP_S = 10.0
+#: Strips that a note names.
+MOST_NAMED = 3
 #: A-priori sigmas of the trajectory that a project message carries.
 SIGMAS = ("offset_sigma_m", "shift_sigma_deg", "drift_sigma_deg", "wander_sigma_m", "wander_sigma_deg")
 
@@ -71,6 +73,15 @@ def not_carried(block: BlockData) -> list[str]:
             notes.append(
                 f"strip {strip.id}: number of lines not known, taken as the {lines_of(strip)} under its trajectory"
             )
+    shift = strip_shifts(block)
+    moved = shift - min(shift, default=0.0)
+    later = [f"{strip.id} by {by:.0f} s" for strip, by in zip(block.strips, moved.tolist(), strict=True) if by]
+    if later:
+        more = f" and {len(later) - MOST_NAMED} more" if len(later) > MOST_NAMED else ""
+        notes.append(
+            "times of strips overlap: in the recording, and in all that is made of it, "
+            f"{', '.join(later[:MOST_NAMED])}{more} are later than in the files"
+        )
     return notes
 
 

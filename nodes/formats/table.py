@@ -168,6 +168,8 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
     try:
         frame = pd.read_csv(
             path,
+            header=0,
+            names=header,  # without the blanks before a separator that pandas would keep
             usecols=list(known),
             dtype={name: str if column.kind == "text" else float for name, column in known.items()},
             keep_default_na=False,

@@ -44,7 +44,7 @@ def test_values_of_a_hand_written_folder(tmp_path):
 
 
 def test_columns_in_any_order_and_unknown_ones(tmp_path):
-    text = "colour,sample,line,ccd,strip,point\nred,499.5,500.25,F,S1,G1\nblue, 510 ,900, N ,S1, G1 \n"
+    text = "colour ,sample , line,ccd ,strip,point \nred,499.5,500.25,F,S1,G1\nblue, 510 ,900, N ,S1, G1 \n"
     block = read_block(write_files(tmp_path, image_points=text))
     assert [block.image_name(i) for i in range(2)] == [("G1", "S1", "F"), ("G1", "S1", "N")]
     np.testing.assert_allclose(block.image.sample, [499.5, 510.0])
