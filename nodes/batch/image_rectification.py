@@ -81,6 +81,8 @@ class SourceImage:
 
     def __init__(self, path: Path, nodata: float | None = None):
         self.file = RasterFile(path, overviews=False)  # pixels that are put together are means of all of them
+        from rasterio.enums import MaskFlags
+
         source = self.file.source
         self.path, self.lines, self.samples = path, self.file.rows, self.file.columns
         self.bands, self.dtype = self.file.count, np.dtype(self.file.dtype)
@@ -93,6 +95,12 @@ class SourceImage:
         # GDAL leaves out of means what the file states; what the command line does, it does not know
         stated = np.array([np.inf if source.nodata is None else source.nodata])
         self._unstated = nodata is not None and not np.array_equal(stated, [nodata], equal_nan=True)
+        # a mask beside the bands or in a file of its own; one that is a band goes into the orthoimage as such
+        self._masked = any(MaskFlags.per_dataset in flags for flags in source.mask_flag_enums)
+        if self._masked:
+            self._unstated = True
+            if self.nodata is None:
+                self.nodata = float("nan") if self.dtype.kind == "f" else 0.0
         self.descriptions = tuple(text or "" for text in source.descriptions)
         self.scales, self.offsets = tuple(source.scales), tuple(source.offsets)
         self.units = tuple(unit or "" for unit in source.units)
@@ -110,11 +118,13 @@ class SourceImage:
         from rasterio.windows import Window
 
         window = Window(sample * factor, line * factor, samples * factor, lines * factor)  # type: ignore[call-arg]
-        if factor == 1:
-            return self._read(window=window)
-        if self._unstated:
-            return self._means(self._read(window=window), lines, samples, factor)
-        return self._read(window=window, out_shape=(lines, samples), resampling=Resampling.average)
+        if factor > 1 and not self._unstated:
+            return self._read(window=window, out_shape=(lines, samples), resampling=Resampling.average)
+        pixels = self._read(window=window)
+        if self._masked:
+            there = self.file.source.dataset_mask(window=window) != 0
+            pixels = np.where(there, self._apart(pixels), np.array(self.nodata, dtype=self.dtype))
+        return pixels if factor == 1 else self._means(pixels, lines, samples, factor)
 
     def _read(self, **how: Any) -> NDArray[Any]:
         """All bands in the one type of the orthoimage; rasterio reads bands of different types one by one alone."""
@@ -135,10 +145,15 @@ class SourceImage:
         count = there.sum(axis=(2, 4))
         mean = np.where(there, blocks, 0).sum(axis=(2, 4), dtype=np.float64) / np.maximum(count, 1)
         if self.dtype.kind in "iu":
-            mean = np.rint(mean)
-            step = 1.0 if self.nodata < np.iinfo(self.dtype).max else -1.0
-            mean = np.where(mean == self.nodata, self.nodata + step, mean)
+            mean = self._apart(np.rint(mean))
         return np.where(count > 0, mean, self.nodata).astype(self.dtype)
+
+    def _apart(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values of which none would be taken for no data."""
+        if self.dtype.kind not in "iu" or self.nodata is None:
+            return values
+        step = 1 if self.nodata < np.iinfo(self.dtype).max else -1
+        return np.where(values == self.nodata, values + step, values)
 
     def valid(self, band: NDArray[Any]) -> Mask | None:
         """Which values of a band are data, None for all."""

@@ -296,6 +296,24 @@ def test_no_data_takes_no_part_where_pixels_are_put_together(scene, tmp_path, st
     assert out.nodata == 7 and set(np.unique(values)) == {7, 200} and (values == 200).sum() > 500
 
 
+@pytest.mark.parametrize("internal", [True, False])
+@pytest.mark.parametrize(("gsd", "value"), [(10, 200), (40, 200), (10, 0)])
+def test_what_a_mask_of_the_file_leaves_out_is_no_data(scene, tmp_path, internal, gsd, value):
+    """A value that the orthoimage has for no data is moved by one."""
+    _, path, *_ = scene
+    pixels = np.full((1, TRUTH.lines, TRUTH.samples), value, dtype=np.uint8)
+    there = np.full(pixels.shape[1:], True)
+    pixels[0, :, : TRUTH.samples // 2 + 3], there[:, : TRUTH.samples // 2 + 3] = 90, False
+    image = write_image(tmp_path / "half.tif", pixels)
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=internal), rasterio.open(image, "r+") as target:
+        target.write_mask(there)
+    assert (tmp_path / "half.tif.msk").exists() != internal
+    out = rectify(tmp_path, image, path, "--height", 0, "--gsd", gsd)
+    values = out.read(1)
+    seen = max(value, 1)
+    assert out.nodata == 0 and set(np.unique(values)) == {0, seen} and (values == seen).sum() > 500
+
+
 def test_values_that_would_be_taken_for_no_data_stay(scene, tmp_path):
     _, path, *_ = scene
     image = write_image(tmp_path / "black.tif", np.zeros((1, TRUTH.lines, TRUTH.samples), dtype=np.uint8))
