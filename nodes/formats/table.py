@@ -165,20 +165,20 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
     header = _header(path, columns, notes)
     separator, decimal = separator_of(path)
     known = {name: column for column in columns for name in column.names if name in header}
+    text: dict[str, Any] = {
+        "skipinitialspace": True, "encoding": "utf-8-sig", "index_col": False, "sep": separator, "decimal": decimal
+    }  # fmt: skip
     try:
+        # pandas keeps blanks before a separator
+        label = {str(found).strip(): found for found in pd.read_csv(path, nrows=0, **text).columns}
+        label = {name: label.get(name, name) for name in known}
         frame = pd.read_csv(
             path,
-            header=0,
-            names=header,  # without the blanks before a separator that pandas would keep
-            usecols=list(known),
-            dtype={name: str if column.kind == "text" else float for name, column in known.items()},
+            usecols=list(label.values()),
+            dtype={label[name]: str if column.kind == "text" else float for name, column in known.items()},
             keep_default_na=False,
-            na_values={name: [""] for name, column in known.items() if column.kind != "text" and column.blank},
-            skipinitialspace=True,
-            encoding="utf-8-sig",
-            index_col=False,
-            sep=separator,
-            decimal=decimal,
+            na_values={label[n]: [""] for n, column in known.items() if column.kind != "text" and column.blank},
+            **text,
             **exact,
         )
     except (ValueError, pd.errors.ParserError):  # pandas does not say where, so every line is checked
@@ -194,11 +194,11 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
     for name, column in known.items():
         if column.kind == "text":
             # few different names in many rows: each name is cleaned once
-            codes, names = pd.factorize(frame[name], use_na_sentinel=False)
+            codes, names = pd.factorize(frame[label[name]], use_na_sentinel=False)
             clean = np.array([str(word).strip() if isinstance(word, str) else "" for word in names], dtype=object)
             read: NDArray[Any] = clean[codes] if len(clean) else np.empty(0, dtype=object)
         else:
-            read = frame[name].to_numpy(dtype=float)
+            read = frame[label[name]].to_numpy(dtype=float)
         values[column.name] = read
         if not column.fits(read).all():
             raise UserError(one_line(_problems(path, known) or [f"{path}: {name}: unreadable value"]))
