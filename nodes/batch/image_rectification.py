@@ -76,7 +76,7 @@ class SourceImage:
 
     Raises
     ------
-    UserError : not there, not an image, complex numbers
+    UserError : not there, not an image, complex numbers, a no-data value that its type does not hold
     """
 
     def __init__(self, path: Path, nodata: float | None = None):
@@ -91,6 +91,10 @@ class SourceImage:
         self._mixed = len(set(source.dtypes)) > 1
         if self._mixed:
             self.dtype = np.result_type(*[np.dtype(name) for name in source.dtypes])
+        if nodata is not None and self.dtype.kind in "iu":
+            low, high = np.iinfo(self.dtype).min, np.iinfo(self.dtype).max
+            if not low <= nodata <= high or nodata != int(nodata):
+                raise UserError(f"--nodata {nodata:g}: wanted a whole number from {low} to {high}, as {path} has")
         self.nodata = nodata if nodata is not None else source.nodata
         # GDAL leaves out of means what the file states; what the command line does, it does not know
         stated = np.array([np.inf if source.nodata is None else source.nodata])
@@ -153,7 +157,7 @@ class SourceImage:
         if self.dtype.kind not in "iu" or self.nodata is None:
             return values
         step = 1 if self.nodata < np.iinfo(self.dtype).max else -1
-        return np.where(values == self.nodata, values + step, values)
+        return np.where(values == self.nodata, np.array(self.nodata + step, dtype=values.dtype), values)
 
     def valid(self, band: NDArray[Any]) -> Mask | None:
         """Which values of a band are data, None for all."""

@@ -79,8 +79,8 @@ def not_carried(block: BlockData) -> list[str]:
     if later:
         more = f" and {len(later) - MOST_NAMED} more" if len(later) > MOST_NAMED else ""
         notes.append(
-            "times of strips overlap: in the recording, and in all that is made of it, "
-            f"{', '.join(later[:MOST_NAMED])}{more} are later than in the files"
+            "times of strips overlap: the recording, and all that is made of it, has strips later than the files do: "
+            f"{', '.join(later[:MOST_NAMED])}{more}"
         )
     return notes
 

@@ -324,7 +324,9 @@ class Matcher(Node):
         if sample.covariance is None:
             raise ValueError("pose without covariance")
         time_s = (sample.time_ns - self._reference_ns) * 1e-9
-        quaternion = quaternion_multiply(sample.quaternion, _BACK[self._mounting[0]])
+        turns, quaternion = self._mounting[0], sample.quaternion
+        if turns:
+            quaternion = quaternion_multiply(quaternion, _BACK[turns])
         if not self._matcher.add_pose(time_s, sample.position_l, quaternion, sample.covariance):
             self.problem("pose out of order", f"pose of {time_s:.3f} s came twice or too late")
 

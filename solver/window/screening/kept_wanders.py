@@ -26,7 +26,7 @@ class KeptWanders:
         self._equations_then, self._first_s = np.zeros(2), np.full(2, np.inf)
 
     def keeps(self, factor: Array, equations: IntArray, final_to_s: float) -> tuple[bool, bool]:
-        """Whether what is present keeps its largest factors.
+        """Whether what is present keeps its largest factors; asked each time sigmas are stated anew, and remembered.
 
         Not where the other wander has become much larger since: then it was that one all along. Nor where the same data
         ask for much less now that there are more of them. A step of the GNSS does not become smaller by that: its

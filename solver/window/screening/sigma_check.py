@@ -166,7 +166,7 @@ class SigmaCheck:
         sigmas, state = self._network.sigmas, self._network.state
         sigmas.apriori, before = factor, state.changes
         kept = (False, False)
-        # where they were noise of looks nothing has happened
+        # where noise of looks had been taken for a wander, nothing has happened that a wander would have to keep
         if sigmas.image == 1.0 and not self._network.pose_noise.vibration:
             equations = strip.equations_present(state)[list(WANDERS)]
             kept = self._kept.keeps(factor[list(WANDERS)], equations, strip.final_to_s)

@@ -297,8 +297,8 @@ def test_no_data_takes_no_part_where_pixels_are_put_together(scene, tmp_path, st
 
 
 @pytest.mark.parametrize("internal", [True, False])
-@pytest.mark.parametrize(("gsd", "value"), [(10, 200), (40, 200), (10, 0)])
-def test_what_a_mask_of_the_file_leaves_out_is_no_data(scene, tmp_path, internal, gsd, value):
+@pytest.mark.parametrize(("gsd", "value", "nodata"), [(10, 200, 0), (40, 200, 0), (10, 0, 0), (10, 255, 255)])
+def test_what_a_mask_of_the_file_leaves_out_is_no_data(scene, tmp_path, internal, gsd, value, nodata):
     """A value that the orthoimage has for no data is moved by one."""
     _, path, *_ = scene
     pixels = np.full((1, TRUTH.lines, TRUTH.samples), value, dtype=np.uint8)
@@ -308,10 +308,19 @@ def test_what_a_mask_of_the_file_leaves_out_is_no_data(scene, tmp_path, internal
     with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=internal), rasterio.open(image, "r+") as target:
         target.write_mask(there)
     assert (tmp_path / "half.tif.msk").exists() != internal
-    out = rectify(tmp_path, image, path, "--height", 0, "--gsd", gsd)
+    out = rectify(tmp_path, image, path, "--height", 0, "--gsd", gsd, *(["--nodata", nodata] if nodata else []))
     values = out.read(1)
-    seen = max(value, 1)
-    assert out.nodata == 0 and set(np.unique(values)) == {0, seen} and (values == seen).sum() > 500
+    seen = {0: 1, 255: 254}.get(value, value)
+    assert out.nodata == nodata and set(np.unique(values)) == {nodata, seen} and (values == seen).sum() > 500
+
+
+@pytest.mark.parametrize("nodata", ["-1", "256", "0.5", "nan"])
+def test_no_data_that_the_type_of_the_image_does_not_hold_is_refused(scene, tmp_path, capsys, nodata):
+    _, path, *_ = scene
+    image = write_image(tmp_path / "image.tif", np.full((1, TRUTH.lines, TRUTH.samples), 200, dtype=np.uint8))
+    words = ["rectify", str(image), "--sensor", str(path), "--height", "0", "-o", str(tmp_path / "out.tif")]
+    assert main([*words, "--nodata", nodata]) == 1
+    assert f"--nodata {nodata}: wanted a whole number from 0 to 255, as" in capsys.readouterr().err
 
 
 def test_values_that_would_be_taken_for_no_data_stay(scene, tmp_path):

@@ -271,7 +271,7 @@ def test_what_a_recording_cannot_carry_is_told(tmp_path):
     assert not_carried(replace(block, strips=block.strips[:1])) == []
     by = strip_shifts(block)[1]
     [note] = not_carried(block)
-    assert note.endswith(f"in all that is made of it, S2 by {by:.0f} s are later than in the files")
+    assert note.endswith(f"has strips later than the files do: S2 by {by:.0f} s")
 
 
 def test_an_imported_block_runs_on_line(tmp_path):
