@@ -101,10 +101,12 @@ def _check_folder(args: argparse.Namespace) -> int:
         names = ", ".join(f"{program.id} ({program.node})" for program in programs)
         print(f"{args.recording}: `triline fly` starts the sensors {names}")
     if not args.quiet:
-        strips = (
-            f"{len(flight.strips)} strip{'s' * (len(flight.strips) > 1)} with images" if flight.strips else "no images"
-        )
-        print(f"{args.recording}: complete; {strips}, ground at {flight.ground_height_m:g} m above the ellipsoid")
+        images = "no images"
+        if flight.strips:
+            images = f"{len(flight.strips)} strip{'s' * (len(flight.strips) > 1)} with images"
+        elif flight.kind == "ros2":
+            images = "image lines as in the bag"
+        print(f"{args.recording}: complete; {images}, ground at {flight.ground_height_m:g} m above the ellipsoid")
     return 0
 
 

@@ -333,6 +333,8 @@ def flight_messages(folder: Path, instead: Instead | None = None) -> tuple[Impor
     refuse_problems(flight)
     if flight.navigation is None or flight.camera is None:
         raise UserError(f"{folder / FILE}: navigation or camera missing")
+    # what was asked of positions once is not asked again; those of tables of sensors are known to their reader only
+    asked = flight.track is None and flight.ground.stated
     options = Options(
         flight.day,
         flight.crs,
@@ -340,7 +342,7 @@ def flight_messages(folder: Path, instead: Instead | None = None) -> tuple[Impor
         camera=flight.camera if flight.kind == "ros2" else None,
         lines=flight.lines,
         accuracy=_accuracy(flight.sigmas),
-        ground=flight.ground if flight.ground.stated else GroundGiven(flight.ground_height_m),
+        ground=flight.ground if asked else GroundGiven(flight.ground_height_m),
         poses_only=bool(flight.strips),
         without_images=instead is not None and instead.files is not None,
         grade=flight.grade,

@@ -243,6 +243,8 @@ class Navigator(Node):
         self._note_time(body.time_ns, "inertial")
         force, rate = (body.force_x, body.force_y, body.force_z), (body.rate_x, body.rate_y, body.rate_z)
         interval_ns = body.interval_ns
+        if not interval_ns and not isinstance(self._engine, InertialNavigator):
+            return []  # the first of a bag, where nobody knows since when it measured; the next one tells
         convert.check_inertial(interval_ns, force, rate)
         if not isinstance(self._engine, InertialNavigator):
             self._engine = inertial_engine(

@@ -472,6 +472,12 @@ def test_zeros_say_that_nothing_wanders(folder):
     assert not flight.problems and flight.sigmas["wander_sigma_m"] == (0.0, 0.0, 0.0)
 
 
+def test_the_height_of_the_ground_is_told_once(folder, tmp_path, capsys):
+    (folder / "flight.toml").write_text(TOML.replace('"ellipsoid"\n', '"ellipsoid"\nabove_ground_m = 1400\n', 1))
+    assert main(["import", str(folder), "-o", str(tmp_path / "out.mcap")]) == 0
+    assert capsys.readouterr().out.count("median height of the flight less 1400 m: the ground is taken to be") == 1
+
+
 def test_an_elevation_model_without_datum_is_asked_for_it(folder):
     write_heights(folder / "dem.tif", Heights("EPSG:4326", np.zeros((4, 4)), LON - 0.15, LAT + 0.15, 0.1, -0.1))
     table = '[dem]\nfile = "dem.tif"\nsigma_m = 0.5\n'

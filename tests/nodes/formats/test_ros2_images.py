@@ -97,6 +97,8 @@ images = {N = "/camera/n/image_raw"}
 line_rate_hz = 200.0
 """
     (tmp_path / "flight.toml").write_text(text)
+    assert main(["check", str(tmp_path)]) == 0
+    assert "complete; image lines as in the bag, ground at 300 m" in capsys.readouterr().out
     out = tmp_path / "out.mcap"
     assert main(["import", str(tmp_path), "-o", str(out)]) == 0
     assert (

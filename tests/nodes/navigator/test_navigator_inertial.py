@@ -267,7 +267,9 @@ def test_bad_samples_are_counted_and_bridged(short, changes, said):
     for i in (rows[0], rows[len(rows) // 3], rows[len(rows) // 3 + 1], rows[-200]):
         wrong[i] = damaged(messages[i], **changes)
     out = run(node, wrong)
-    assert node.counters["malformed"] == 4 and said in node.last_problem and "failed" not in node.counters
+    # the first sample of a bag has no interval: nobody knows since when it measured
+    counted = 3 if changes == {"interval_ns": 0} else 4
+    assert node.counters["malformed"] == counted and said in node.last_problem and "failed" not in node.counters
     assert last_errors(out, truth).mean() < 4.0
 
 
