@@ -99,7 +99,7 @@ def check_layers(layers: list[Layer]) -> None:
 
     Raises
     ------
-    UserError : nothing in any of them, other numbers of bands or data types
+    UserError : nothing in any of them, other numbers of bands or data types, values of other scales or units
     """
     if not layers:
         raise UserError("nothing to put together: no strip or image has a cell in the mosaic")
@@ -110,6 +110,17 @@ def check_layers(layers: list[Layer]) -> None:
                 f"{layer.name}: {layer.bands} bands of {layer.dtype}, but {one.name} has {one.bands} of {one.dtype}: "
                 "wanted one kind of image"
             )
+        for what in ("scales", "offsets", "units"):
+            mine, others = getattr(layer, what), getattr(one, what)
+            if mine != others:
+                raise UserError(
+                    f"{layer.name}: {what} of its bands: {_listed(mine)}, but {one.name} has {_listed(others)}: "
+                    "wanted values that mean the same"
+                )
+
+
+def _listed(values: tuple[object, ...]) -> str:
+    return ", ".join(map(str, values)) or "none"
 
 
 def tiles_of(layers: list[Layer]) -> dict[Key, list[int]]:
@@ -572,10 +583,14 @@ def put_together(
         settings.crs, column * gsd, -row * gsd, gsd, rows, columns, one.bands, one.dtype, one.nodata,
         {"TIFFTAG_SOFTWARE": "triline", **tags},
     )  # fmt: skip
+    # what is meant by the values is said of them alone, not of numbers of layers and sigmas
+    values = replace(
+        raster, descriptions=one.descriptions, scales=one.scales, offsets=one.offsets, units=one.units
+    )  # fmt: skip
     names = {"layers": ", ".join(f"{k + 1} {layer.name}" for k, layer in enumerate(layers))}
     source = replace(raster, bands=1, dtype="uint16", nodata=0, tags=names, descriptions=("layer of the cell",))
     kinds: list[tuple[str, Path, Raster, str]] = [
-        ("tif", outputs.mosaic, raster, "average"), ("source.tif", outputs.source, source, "nearest")
+        ("tif", outputs.mosaic, values, "average"), ("source.tif", outputs.source, source, "nearest")
     ]  # fmt: skip
     if outputs.sigma is not None:
         sigma = replace(raster, bands=2, dtype="float32", nodata=float("nan"), descriptions=SIGMA_BANDS)

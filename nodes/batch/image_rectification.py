@@ -25,6 +25,7 @@ from ...solver.rectification.sampled import some_cells
 from ..errors import UserError
 from ..formats.geotiff import BLOCK, SIGMA_BANDS, Raster, tiled_orthoimage
 from ..formats.height_raster import HeightRaster, RasterFile
+from ..formats.raster_open import check_grey_values
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -76,7 +77,8 @@ class SourceImage:
 
     Raises
     ------
-    UserError : not there, not an image, complex numbers, a no-data value that its type does not hold
+    UserError : not there, not an image, complex numbers, numbers of a colour table, a no-data value that its type does
+        not hold
     """
 
     def __init__(self, path: Path, nodata: float | None = None):
@@ -86,8 +88,7 @@ class SourceImage:
         source = self.file.source
         self.path, self.lines, self.samples = path, self.file.rows, self.file.columns
         self.bands, self.dtype = self.file.count, np.dtype(self.file.dtype)
-        if any(np.dtype(name).kind == "c" for name in source.dtypes):
-            raise UserError(f"{path}: complex numbers, wanted grey values")
+        check_grey_values(path, source)
         self._mixed = len(set(source.dtypes)) > 1
         if self._mixed:
             self.dtype = np.result_type(*[np.dtype(name) for name in source.dtypes])

@@ -21,6 +21,7 @@ from ...solver.orthoimage.mosaic import Mosaic
 from ..errors import UserError
 from ..formats.geotiff import SIGMA_BANDS, Draft, Raster, pieces_of_raster
 from ..formats.height_raster import RasterFile
+from ..formats.raster_open import check_grey_values
 from .mosaic_jobs import read_json, write_json
 
 Array = NDArray[np.floating]
@@ -46,6 +47,7 @@ class Layer:
     bands, dtype, nodata : of its values
     tiles : (row, column) of the tiles of the mosaic with something in them
     told : for people: lines, what was left out
+    descriptions, scales, offsets, units : of its bands as a `Raster` has them; empty where nothing is stated
     """
 
     name: str
@@ -62,6 +64,10 @@ class Layer:
     nodata: float
     tiles: list[tuple[int, int]]
     told: dict[str, Any]
+    descriptions: tuple[str, ...] = ()
+    scales: tuple[float, ...] = ()
+    offsets: tuple[float, ...] = ()
+    units: tuple[str, ...] = ()
 
     def write(self, path: Path) -> None:
         write_json(path, asdict(self))
@@ -70,6 +76,7 @@ class Layer:
     def read(cls, path: Path) -> Layer:
         found = read_json(path)
         found["tiles"] = [tuple(tile) for tile in found["tiles"]]
+        found |= {name: tuple(found[name]) for name in ("descriptions", "scales", "offsets", "units")}
         return cls(**found)
 
 
@@ -222,8 +229,7 @@ def layer_of_orthoimage(
         ):  # fmt: skip
             raise UserError(f"{sigma}: its cells are not those of {path}")
     dtype = np.dtype(source.dtype)
-    if dtype.kind == "c":
-        raise UserError(f"{path}: complex numbers, wanted grey values")
+    check_grey_values(path, source.source)
     nodata = source.source.nodata
     if nodata is None:
         nodata = float("nan") if dtype.kind == "f" else 0.0
@@ -257,9 +263,14 @@ def layer_of_orthoimage(
                 target.write(r, c, np.where(valid, np.clip(np.rint(steep), 1, 255), 0).astype(np.uint8)[None])
                 for i in range((row + r) // tile, (row + r + h - 1) // tile + 1):
                     tiles |= {(i, j) for j in range((column + c) // tile, (column + c + w - 1) // tile + 1)}
+    about = source.source
+    scaled = any(scale != 1.0 for scale in about.scales) or any(about.offsets)
     return Layer(
         name, "", str(path), str(steepness), sigma and str(sigma), row, column, source.rows, source.columns,
         source.count, dtype.name, float(nodata), sorted(tiles), {},
+        descriptions=tuple(text or "" for text in about.descriptions) if any(about.descriptions) else (),
+        scales=tuple(about.scales) if scaled else (), offsets=tuple(about.offsets) if scaled else (),
+        units=tuple(unit or "" for unit in about.units) if any(about.units) else (),
     )  # fmt: skip
 
 

@@ -321,6 +321,9 @@ def write_virtual(path: Path, raster: Raster, tiles: list[TilePlace]) -> None:
             out.append(f"<Description>{escape(raster.descriptions[band - 1])}</Description>")
         if raster.nodata is not None:
             out.append(f"<NoDataValue>{raster.nodata:.17g}</NoDataValue>")
+        for name, values in (("UnitType", raster.units), ("Offset", raster.offsets), ("Scale", raster.scales)):
+            if values:
+                out.append(f"<{name}>{escape(str(values[band - 1]))}</{name}>")
         for tile in tiles:
             top, left = max(tile.row, 0), max(tile.column, 0)
             height = min(tile.row + tile.rows, raster.rows) - top

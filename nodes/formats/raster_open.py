@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import UserError
+
 #: Values that mean that no height is known, in rasters that do not say which does; so do those beyond `_NO_HEIGHT`.
 _VOIDS, _NO_HEIGHT = (-9999.0, -32767.0, -32768.0), 1e30
 #: Units of heights that count as metres.
@@ -51,6 +53,23 @@ def is_raster(path: Path) -> bool:
     except RasterioError:
         return False
     return True
+
+
+def check_grey_values(path: Path, source: Any) -> None:
+    """Refuse a dataset between whose values nothing can be interpolated.
+
+    Raises
+    ------
+    UserError : complex numbers, or numbers of a colour table
+    """
+    from rasterio.enums import ColorInterp
+
+    if any(np.dtype(name).kind == "c" for name in source.dtypes):
+        raise UserError(f"{path}: complex numbers, wanted grey values")
+    if ColorInterp.palette in source.colorinterp:  # between number 3 and number 5 is no colour in the middle
+        raise UserError(
+            f"{path}: numbers of a colour table, wanted grey values (gdal_translate -expand rgb makes them)"
+        )
 
 
 def unit_of_heights(source: Any) -> str:

@@ -310,9 +310,11 @@ def test_each_raster_is_what_its_ending_says(block, made, tmp_path, capsys, endi
     assert told["source"] == str(tmp_path / ("source.vrt" if ending == "tif" else "block.source.vrt"))
 
 
-@pytest.mark.parametrize("dtype", ["int8", "int64", "uint64", "complex64"])
+@pytest.mark.parametrize("dtype", ["int8", "int64", "uint64", "complex64", "colour table"])
 def test_orthoimages_of_every_whole_number(dtype, tmp_path, capsys):
     """Those of 8 bits with a sign and of 64 bits ended in a fault, as complex numbers did, which are refused."""
+    refused = {"complex64": "complex numbers", "colour table": "numbers of a colour table"}.get(dtype)
+    colours, dtype = dtype == "colour table", dtype.replace("colour table", "uint8")
     values = np.random.default_rng(1).integers(60, 120, (1, 200, 300)).astype(dtype)
     paths = []
     for k in range(2):  # two parts of one image
@@ -321,13 +323,43 @@ def test_orthoimages_of_every_whole_number(dtype, tmp_path, capsys):
         paths.append(tmp_path / f"ortho{k}.tif")
         with rasterio.open(paths[-1], "w", transform=place, nodata=0, **shape) as target:
             target.write(values[:, :, 100 * k : 100 * k + 200])
+            if colours:
+                target.write_colormap(1, {number: (number, 0, 0, 255) for number in range(256)})
     for out in (tmp_path / "m.tif", tmp_path / "m.vrt"):
         code = main(["rectify", *map(str, paths), "--mosaic", "-o", str(out), "--workers", "1", "-q"])
-        if dtype == "complex64":
-            assert code == 1 and "ortho0.tif: complex numbers, wanted grey values" in capsys.readouterr().err
+        if refused:
+            assert code == 1 and f"ortho0.tif: {refused}, wanted grey values" in capsys.readouterr().err
             continue
         with rasterio.open(out) as mosaic:
             assert code == 0 and mosaic.dtypes == (dtype,) and (mosaic.read() == values).all()
+
+
+def test_a_mosaic_says_what_the_values_of_its_orthoimages_mean(tmp_path, capsys):
+    values = np.random.default_rng(1).integers(600, 1200, (2, 200, 300)).astype(np.uint16)
+    shape = {"driver": "GTiff", "height": 200, "width": 200, "count": 2, "dtype": "uint16", "crs": "EPSG:32632"}
+    paths = [tmp_path / f"ortho{k}.tif" for k in range(2)]
+
+    def write(k, scale):
+        place = rasterio.Affine(2, 0, 500_000 + 200 * k, 0, -2, 5_000_000)
+        with rasterio.open(paths[k], "w", transform=place, nodata=0, **shape) as target:
+            target.write(values[:, :, 100 * k : 100 * k + 200])
+            target.scales, target.offsets, target.units = (scale, 1.0), (-0.1, 0.0), ("1", "K")
+            target.descriptions = "reflectance", "temperature"
+
+    write(0, 1e-4)
+    write(1, 1e-4)
+    for out in (tmp_path / "m.tif", tmp_path / "m.vrt"):
+        words = ["rectify", *map(str, paths), "--mosaic", "-o", str(out), "--workers", "1", "-q"]
+        assert main(words) == 0
+        with rasterio.open(out) as mosaic:
+            assert (mosaic.scales, mosaic.offsets, mosaic.units) == ((1e-4, 1.0), (-0.1, 0.0), ("1", "K"))
+            assert mosaic.descriptions == ("reflectance", "temperature")
+        with rasterio.open(tmp_path / f"m.source{out.suffix}") as source:
+            assert source.scales == (1.0,) and source.units == (None,)
+    write(1, 1e-3)
+    assert main(words) == 1
+    wanted = "scales of its bands: 0.001, 1.0, but ortho0 has 0.0001, 1.0: wanted values that mean the same"
+    assert wanted in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("crs", ["EPSG:3035", "EPSG:2193", "EPSG:32632", "EPSG:25832+7837"])
