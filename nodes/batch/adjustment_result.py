@@ -445,7 +445,20 @@ def _test_notes(adjustment: Adjustment) -> list[str]:
         names = ", ".join(f"{network.point_ids[p]} {'XYZ'[a]} ({w[p, a]:+.1f})" for p, a in worst[:5])
         more = " ..." if len(worst) > 5 else ""
         notes.append(f"{len(worst)} control coordinates have |w| > {critical:g}: {names}{more}")
-    return notes
+    return notes + _deserted_control(result)
+
+
+def _deserted_control(result: BatchResult) -> list[str]:
+    """Control that lost all its image points: nothing contradicts its coordinates any more."""
+    network = result.network
+    known = np.zeros(network.n_points, dtype=bool)
+    known[network.control.point] = np.isfinite(network.control.sigma_m).any(axis=1)
+    used = np.bincount(network.rays.point, result.solution.ray_weight > 0, network.n_points) > 0
+    lost = np.flatnonzero(known & ~used & (network.rays_per_point > 0))
+    if not len(lost):
+        return []
+    names = ", ".join(str(network.point_ids[p]) for p in lost[:5]) + (" ..." if len(lost) > 5 else "")
+    return [f"control that lost all its image points and stands as given: {names}; wrong coordinates, or a wrong name?"]
 
 
 def worst_strip(adjustment: Adjustment) -> str:

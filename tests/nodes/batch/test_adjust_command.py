@@ -531,6 +531,19 @@ def test_control_that_nobody_measured_and_keys_that_nobody_knows_are_told(folder
     assert code == 0 and f"note: no control point of {len(control)} is measured in an image" in out
 
 
+def test_control_that_lost_all_its_image_points_is_named(folder, tmp_path, capsys):
+    """Nothing contradicts its coordinates any more, and without --snoop nobody tests them instead."""
+    block = tmp_path / "block"
+    shutil.copytree(folder, block)
+    points = pd.read_csv(block / "ground_points.csv")
+    wrong = points.query("role == 'control'").index[0]
+    points.loc[wrong, "X_m"] += 40.0
+    points.to_csv(block / "ground_points.csv", index=False)
+    code, out, _ = adjust(block, "-q", "--robust", "igg3", capsys=capsys)
+    named = points.loc[wrong, "point"]
+    assert code == 0 and f"control that lost all its image points and stands as given: {named}; wrong coord" in out
+
+
 def test_control_in_another_unit_is_no_matter_of_sigmas(folder, tmp_path, capsys):
     block = tmp_path / "block"
     shutil.copytree(folder, block)
