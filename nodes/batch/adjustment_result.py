@@ -12,7 +12,7 @@ from ...solver.adjustment.adjustment import Solution
 from ...solver.adjustment.block_data import BlockData
 from ...solver.adjustment.job import BatchResult, Job
 from ...solver.adjustment.layout import CorrectionSet
-from ...solver.adjustment.network import Control
+from ...solver.adjustment.network import Control, Network
 from ...solver.adjustment.reliability import HEAVY_TAILS, NARROWLY, Reliability, reliability
 from ...solver.adjustment.snooping import control_tests
 from ...solver.adjustment.statistics import PointAccuracy, global_test, mean_sigma, strongest_correlations
@@ -47,6 +47,8 @@ CAMERA, PER_LINE = "camera.json", "orientation_lines.csv"
 #: Sigmas so many times as large as stated are a fault of something else.
 UNLIKELY = 20.0
 LIKELIER = "a wrong unit, datum, time or camera is likelier"
+#: Control so many metres from where its rays meet is not where it is stated, whatever the trajectory.
+ELSEWHERE_M = 500.0
 PLOTS = ("residuals.png", "points.png", "corrections.png")
 
 
@@ -461,15 +463,35 @@ def _deserted_control(result: BatchResult) -> list[str]:
     return [f"control that lost all its image points and stands as given: {names}; wrong coordinates, or a wrong name?"]
 
 
-def worst_strip(adjustment: Adjustment) -> str:
-    """Where to look when nothing fits: the strip with the largest median residual, in words."""
+def where_to_look(adjustment: Adjustment) -> str:
+    """What to check when nothing fits, in words: control that lies elsewhere, the strip with the largest residuals."""
     result = adjustment.result
     network = result.network
     size = np.linalg.norm(result.rays.v_px, axis=1)
     median = {s.id: float(np.median(size[network.rays.strip == i])) for i, s in enumerate(network.strips)
               if (network.rays.strip == i).any()}  # fmt: skip
     worst = max(median, key=lambda id: median[id])
-    return f"residuals are largest in strip {worst}, {median[worst]:.0f} px: check its trajectory and line times"
+    said = f"residuals are largest in strip {worst}, {median[worst]:.0f} px: check its trajectory and line times"
+    far = _far_control(network)
+    return f"{far}; {said}" if far else said
+
+
+def _far_control(network: Network) -> str:
+    """Control that lies elsewhere than the rays to it meet before anything is adjusted, in words; "" for none."""
+    rays = network.rays_per_point[network.control.point]
+    known = np.isfinite(network.control.sigma_m) & (rays > 1)[:, None]
+    measured = np.flatnonzero(known.any(axis=1))
+    if not len(measured):
+        return ""
+    points = network.control.point[measured]
+    off = np.where(known[measured], network.control.xyz_l[measured] - network.where_rays_meet(points), 0.0)
+    away = np.linalg.norm(off, axis=1)
+    usual, worst = float(np.median(away)), int(np.argmax(away))
+    if usual > ELSEWHERE_M:
+        return f"control lies {usual:.0f} m from where its rays meet (median): check its coordinate reference system"
+    if away[worst] > ELSEWHERE_M:
+        return f"control point {network.point_ids[points[worst]]} lies {away[worst]:.0f} m from where its rays meet"
+    return ""
 
 
 def _control_notes(result: BatchResult) -> list[str]:
@@ -487,7 +509,7 @@ def _control_notes(result: BatchResult) -> list[str]:
     return [*notes, *_spread_notes(network, control)]
 
 
-def _spread_notes(network: Any, control: Control) -> list[str]:
+def _spread_notes(network: Network, control: Control) -> list[str]:
     full = np.isfinite(control.sigma_m)
     if not full.any():
         return ["no control: position, rotation and scale of the block come from its trajectories"]
@@ -501,7 +523,7 @@ def _spread_notes(network: Any, control: Control) -> list[str]:
     return notes + _notes_on_spread(network, control.xyz_l[measured])
 
 
-def _notes_on_spread(network: Any, xyz: Array) -> list[str]:
+def _notes_on_spread(network: Network, xyz: Array) -> list[str]:
     if len(xyz) < 3:
         return [f"{len(xyz)} control point{'s' if len(xyz) > 1 else ''}: too few to check the datum of the block"]
     spread = np.linalg.svd(xyz[:, :2] - xyz[:, :2].mean(axis=0), compute_uv=False)

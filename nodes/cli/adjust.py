@@ -35,7 +35,7 @@ from ...solver.models.lim import FEWEST_FIXES
 from ...solver.models.platform import MOST_CLOCK_S, MOST_LEVER_ARM_M, USUAL_PLATFORM, PlatformErrors
 from ...solver.partitioned.engine import Engine
 from ...solver.partitioned.part import RAYS
-from ..batch.adjustment_result import CAMERA, PER_LINE, PLOTS, TABLES, Adjustment, result_of, worst_strip
+from ..batch.adjustment_result import CAMERA, PER_LINE, PLOTS, TABLES, Adjustment, result_of, where_to_look
 from ..batch.adjustment_summary import summary_lines
 from ..batch.adjustment_tables import oriented_lines, write_tables
 from ..batch.partition_runner import DaskRunner, FolderStore, ProcessRunner
@@ -485,7 +485,9 @@ def adjust_block(
             tell.close()
     adjustment = Adjustment(block, job, result, time.perf_counter() - start)
     if not result.solution.converged and result.test.sigma0 > HOPELESS:
-        raise UserError(f"{block.name}: does not converge (sigma0 {result.test.sigma0:.3g}); {worst_strip(adjustment)}")
+        raise UserError(
+            f"{block.name}: does not converge (sigma0 {result.test.sigma0:.3g}); {where_to_look(adjustment)}"
+        )
     return adjustment
 
 

@@ -681,6 +681,22 @@ def test_block_that_does_not_fit_at_all_is_refused_with_the_strip_to_blame(folde
     assert "does not converge" in message and "strip S2" in message
 
 
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [
+        (1, "control point P0 lies 100000 m from where its rays meet; residuals are"),
+        (99, "control lies 100000 m from where its rays meet (median): check its coordinate reference system"),
+    ],
+)
+def test_control_in_another_country_is_named_where_nothing_fits(folder, tmp_path, capsys, points, said):
+    far = tmp_path / "far"
+    shutil.copytree(folder, far)
+    ground = pd.read_csv(far / "ground_points.csv")
+    ground.loc[ground[ground.role == "control"].index[:points], "X_m"] += 1e5
+    ground.to_csv(far / "ground_points.csv", index=False)
+    assert said in refusal(capsys, far, "-q")
+
+
 def test_one_control_point_a_kilometre_off_is_left_out(folder, tmp_path):
     wrong = tmp_path / "wrong"
     shutil.copytree(folder, wrong)
