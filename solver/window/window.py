@@ -165,8 +165,8 @@ class Window:
 
     @property
     def in_doubt(self) -> bool:
-        """Whether new looks disagree more than the sigmas say, or are too few to tell."""
-        return self.options.snoop and self._disagreement.in_doubt
+        """Whether new looks disagree more than the sigmas say or are too few to tell, or sigmas are just changing."""
+        return self.options.snoop and (self._disagreement.in_doubt or not self._sigma_check.settled(self._now_s))
 
     def begin_strip(
         self,

@@ -52,6 +52,8 @@ PLENTY = 10.0
 LEAST_REDUNDANCY = 0.2
 #: Looks are questioned when so many looks at the slow errors have changed nothing. Tuned.
 STEADY = 3
+#: Sigmas are settled when none has changed for so long, s. Tuned.
+SETTLED_S = 3.0
 #: Each time looks show a wander, both wanders are stated so many times as large. Tuned.
 RAISED = 1.5
 #: What the operator is told of the additional parameters.
@@ -83,11 +85,16 @@ class SigmaCheck:
         self._pairs = (WANDERS, CONSTANT)[: 1 + constants]
         self._told = np.ones(len(ERROR_GROUPS) + 2)
         self._vibration = 0.0
-        self._steady = 0
+        self._steady, self._changed_s, self._tells = 0, -np.inf, False
         self._told_platform: set[str] = set()
         self._likelihoods: dict[tuple[int, int], Likelihood] = {}
         self._kept = KeptWanders()
         self.events: list[str] = []
+
+    def settled(self, now_s: float) -> bool:
+        """Whether no sigma has been stated anew lately, and there are looks enough to tell their noise."""
+        self._tells = self._tells or len(self._looks.controlled()) >= LEAST_LOOKS
+        return self._tells and now_s > self._changed_s + SETTLED_S
 
     def look(self, now_s: float, due: bool, turns: int = 1) -> tuple[bool, bool]:
         """Compare residuals with sigmas where that is due; whether those of slow errors and of looks were changed.
@@ -122,6 +129,7 @@ class SigmaCheck:
             elif judged is not None:
                 of_image = self._looks.restate(judged)
         if of_slow or of_image:
+            self._changed_s = now_s
             self._restate(strip, np.clip(factor, 1.0, LARGEST))
             network.state.solve()
         self._tell()
