@@ -409,10 +409,10 @@ def test_a_mounting_is_quarters_of_a_turn_and_what_is_left(heading_deg, turns):
     assert R_fi[0, 0] > 0.65  # x goes along the flight
 
 
-def test_a_camera_may_be_mounted_turned_and_oblique(tmp_path, messages):
+def test_a_camera_may_be_mounted_turned_and_oblique(tmp_path, short):
     """The whole orientation is that of the same flight with a camera that is mounted straight."""
     flown = {}
-    for name, sees in (("straight", messages), ("turned", _mounted(messages, (5.0, 25.0, 90.0)))):
+    for name, sees in (("straight", short), ("turned", _mounted(short, (5.0, 25.0, 90.0)))):
         folder = tmp_path / name
         folder.mkdir()
         summary, ties, _ = run(folder, sees)
