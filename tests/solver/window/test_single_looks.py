@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from three_strips import OPTIONS, PLAN, TIES, flown
+from three_strips import OPTIONS, PLAN, SIDE_BY_SIDE, TIES, flown, usual, usual_at_once, usual_online
 
 from triline.solver.simulation.window_study import adjust_at_once, adjust_online, orientation_errors
 from triline.solver.window.block import archive, points
@@ -19,23 +19,30 @@ ALONE = "too few looks"
 
 @pytest.fixture(scope="module")
 def flight():
-    return flown()
+    return usual()
 
 
 @pytest.fixture(scope="module")
-def online(flight):
-    return adjust_online(*flight, OPTIONS, live=False, update_s=0.5)
+def online():
+    return usual_online()
+
+
+@pytest.fixture(scope="module")
+def side_by_side():
+    """Two shorter strips, and what the window makes of them."""
+    flight = flown(SIDE_BY_SIDE)
+    return flight, adjust_online(*flight, OPTIONS, live=False, update_s=0.5)
 
 
 def looks_of(result, reason):
     return [(r.point, r.look) for r in result.refused if r.reason == reason]
 
 
-def test_a_single_look_counts_when_another_strip_sees_its_point(flight, online):
+def test_a_single_look_counts_when_another_strip_sees_its_point(online):
     alone, back = looks_of(online, ALONE), looks_of(online, TAKEN_BACK)
     assert len(back) == len(set(back)) >= 8
     assert set(back) <= set(alone)
-    batch = adjust_at_once(*flight, OPTIONS)
+    batch = usual_at_once()
     for name, look in back:
         whole, wanted = online.whole_points[name], batch.final_points[name]
         assert look in [r.look for r in whole.residuals]
@@ -46,8 +53,9 @@ def test_a_single_look_counts_when_another_strip_sees_its_point(flight, online):
 
 
 @pytest.mark.parametrize("later", [False, True])
-def test_a_look_along_the_ground_is_left_out_and_nothing_else(flight, online, monkeypatch, later):
+def test_a_look_along_the_ground_is_left_out_and_nothing_else(side_by_side, monkeypatch, later):
     """Its line and sample tell the same: there is no place for its point, at once or when another strip sees it."""
+    flight, online = side_by_side
     spoilt = {name for name, _ in looks_of(online, TAKEN_BACK)[:3]}
     rows_of, seen = points.rows_of, set()
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from three_strips import OPTIONS, PLAN, SENSORS, TIES, flown
+from three_strips import OPTIONS, PLAN, SENSORS, SIDE_BY_SIDE, TIES, flown, usual, usual_at_once, usual_online
 
 from triline.solver.adjustment.dense_in_parts import in_one_go
 from triline.solver.simulation.scenario import simulate
@@ -25,17 +25,37 @@ from triline.solver.window.block import block as window_block
 
 @pytest.fixture(scope="module")
 def flight():
-    return flown()
+    return usual()
 
 
 @pytest.fixture(scope="module")
-def online(flight):
-    return adjust_online(*flight, OPTIONS, live=False, update_s=0.5)
+def online():
+    return usual_online()
 
 
 @pytest.fixture(scope="module")
-def batch(flight):
-    return adjust_at_once(*flight, OPTIONS)
+def batch():
+    return usual_at_once()
+
+
+@pytest.fixture(scope="module")
+def bounded(flight):
+    """The flight with a block that may hold few unknowns, what was published of each time, and solutions of it."""
+    published, solved = Counter(), []
+    plain, solving = window_block.Block.refined, window_archive.Archive.solving
+
+    def watched(self, now_s, steps, at_the_end):
+        result = plain(self, now_s, steps, at_the_end)
+        if result is not None:
+            published.update((o.strip, float(o.time_s[0])) for o in result.orientation)
+        return result
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(window_archive, "BLOCK_UNKNOWNS", 200)
+        patch.setattr(window_block.Block, "refined", watched)
+        patch.setattr(window_archive.Archive, "solving", lambda *a: solved.append(1) or solving(*a))
+        result = adjust_online(*flight, OPTIONS, live=False, update_s=0.5)
+    return result, published, solved
 
 
 def joined(orientations):
@@ -82,9 +102,9 @@ def test_the_backward_pass_of_the_block_is_that_of_the_window_where_there_is_one
     assert block.whole_points.keys() == chain.whole_points.keys()
 
 
-def test_sigmas_that_a_later_strip_shows_to_be_larger_count_for_the_earlier_ones_too(flight, online):
+def test_sigmas_that_a_later_strip_shows_to_be_larger_count_for_the_earlier_ones_too():
     """As if they had been known from the start: all strips were measured with the same instruments."""
-    simulation, _ = flight
+    simulation, poses = flown(SIDE_BY_SIDE)
 
     def whole(since_s):
         def larger(now_s, window):
@@ -94,13 +114,14 @@ def test_sigmas_that_a_later_strip_shows_to_be_larger_count_for_the_earlier_ones
                 for strip in network.flown:
                     strip.restate_sigmas(network.sigmas.apriori, network.state)
 
-        return adjust_online(*flight, OPTIONS, live=False, update_s=0.5, watch=larger).whole
+        return adjust_online(simulation, poses, OPTIONS, live=False, update_s=0.5, watch=larger).whole
 
-    (begin, _), (second, _), _ = simulation.flight.strip_times_s
+    (begin, _), (second, _) = simulation.flight.strip_times_s
     from_the_start = whole(begin + 2.0)
     difference, sigma = far_apart(whole(second + 5.0), from_the_start)
     assert difference < 0.05 and sigma < 0.005
-    assert far_apart(online.whole, from_the_start)[1] > 0.2, "these are other sigmas"
+    as_stated = adjust_at_once(simulation, poses, OPTIONS).final
+    assert far_apart(as_stated, from_the_start)[1] > 0.2, "these are other sigmas"
 
 
 def test_a_later_strip_knows_what_the_earlier_ones_say_of_its_points(flight, online):
@@ -181,29 +202,16 @@ def test_a_strip_that_is_closed_leaves_what_it_says_of_the_others(online):
     assert Q_again / sigma / sigma[:, None] == pytest.approx(Q / sigma / sigma[:, None], abs=1e-7)
 
 
-def test_a_block_keeps_its_bounds_and_says_so(flight, monkeypatch):
-    monkeypatch.setattr(window_archive, "BLOCK_UNKNOWNS", 200)
-    bounded = adjust_online(*flight, OPTIONS, live=False, update_s=0.5)
-    assert sum("refined no more" in text for text in bounded.events) == 2
-    assert {o.strip for o in bounded.whole} == {"S1", "S2", "C1"}
-    assert list(bounded.window._block._archive.strips) == ["C1"]
-    assert 0.3 < orientation_errors(flight[0], bounded.whole).nees.mean() < 2.0
+def test_a_block_keeps_its_bounds_and_says_so(flight, bounded):
+    result, _, _ = bounded
+    assert sum("refined no more" in text for text in result.events) == 2
+    assert {o.strip for o in result.whole} == {"S1", "S2", "C1"}
+    assert list(result.window._block._archive.strips) == ["C1"]
+    assert 0.3 < orientation_errors(flight[0], result.whole).nees.mean() < 2.0
 
 
-def test_strips_are_published_when_they_are_over_and_when_they_are_closed_no_more_often(flight, monkeypatch):
-    monkeypatch.setattr(window_archive, "BLOCK_UNKNOWNS", 200)
-    published, solved = Counter(), []
-    plain, solving = window_block.Block.refined, window_archive.Archive.solving
-
-    def watched(self, now_s, steps, at_the_end):
-        result = plain(self, now_s, steps, at_the_end)
-        if result is not None:
-            published.update((o.strip, float(o.time_s[0])) for o in result.orientation)
-        return result
-
-    monkeypatch.setattr(window_block.Block, "refined", watched)
-    monkeypatch.setattr(window_archive.Archive, "solving", lambda *a: solved.append(1) or solving(*a))
-    adjust_online(*flight, OPTIONS, live=False, update_s=0.5)
+def test_strips_are_published_when_they_are_over_and_when_they_are_closed_no_more_often(bounded):
+    _, published, solved = bounded
     # the first is published twice: at its end, and when the end of the second closes it
     assert {strip for strip, _ in published} == {"S1", "S2", "C1"}
     assert {n for (strip, _), n in published.items() if strip == "S1"} == {2}
