@@ -36,17 +36,23 @@ def rmse(simulation, online) -> float:
 
 
 @cache
-def flown(share: float, known: str = "calibrated", row: str = "stated", seed: int = 1):
-    """A flight with carrier-phase GNSS whose camera is off by a share of 0.1 mm at the edge, about, through the
-    window."""
+def measured(share: float, row: str, seed: int):
+    """A flight with carrier-phase GNSS whose camera is off by a share of 0.1 mm at the edge, about, and its poses."""
     if share:
         stated = tls(PLAN.camera, 12).scaled(share)
         simulation = simulate_with_camera_errors(PLAN, seed, stated, SETTINGS["rtk"], OBSERVED)
     else:
         simulation = simulate(PLAN, seed, SETTINGS["rtk"], OBSERVED, world=ROWS[row].world)
+    return simulation, navigate(simulation)
+
+
+@cache
+def flown(share: float, known: str = "calibrated", row: str = "stated", seed: int = 1):
+    """Such a flight through the window."""
+    simulation, poses = measured(share, row, seed)
     parameters = left_by_calibration(PLAN.camera) if known == "calibrated" else focal_length(PLAN.camera)
     online = adjust_online(
-        simulation, navigate(simulation), OPTIONS, parameters, live=False, update_s=0.5, platform=PlatformErrors(1e-3)
+        simulation, poses, OPTIONS, parameters, live=False, update_s=0.5, platform=PlatformErrors(1e-3)
     )
     return simulation, online
 
@@ -127,7 +133,7 @@ def test_a_camera_that_must_not_be_estimated_is_told():
     assert any(r.quality.camera is not None and r.quality.light == FAILED for r in online.reports)
 
 
-@pytest.mark.parametrize("row", ["stated", "sine-fast", "boresight"])
-def test_no_other_error_is_told_as_the_camera(row):
-    _, online = flown(0.0, "focal", row, 3)
+@pytest.mark.parametrize(("row", "seed"), [("stated", 1), ("sine-fast", 3), ("boresight", 3)])
+def test_no_other_error_is_told_as_the_camera(row, seed):
+    _, online = flown(0.0, "focal", row, seed)
     assert all(r.quality.camera is None for r in online.reports)
