@@ -40,15 +40,20 @@ def size_of(root, without=()) -> int:
     return total
 
 
-@pytest.fixture(scope="module")
-def flight():
-    """Many short strips side by side."""
+def flown(strips):
+    """Short strips side by side."""
     plan = FlightPlan(
-        strips=9, strip_s=9.0, height_m=400.0, relief_m=10.0, sidelap=0.4, turns=False, gap_s=9.0, lead_in_s=3.0,
+        strips=strips, strip_s=9.0, height_m=400.0, relief_m=10.0, sidelap=0.4, turns=False, gap_s=9.0, lead_in_s=3.0,
         lead_out_s=2.0,
     )  # fmt: skip
     simulation = simulate(plan, 5, SENSORS, ObservationPlan(tie_points_per_s=4.0, control=2, check=2))
     return simulation, list(navigate(simulation))
+
+
+@pytest.fixture(scope="module")
+def flight():
+    """Many strips."""
+    return flown(9)
 
 
 @pytest.mark.study
@@ -75,7 +80,7 @@ def test_what_the_window_keeps_does_not_grow_with_the_flight(flight, monkeypatch
     assert {name: round(g) for name, g in growth.items() if g > 10_000.0} == {}
 
 
-def test_exposed_observations_are_those_of_batches_in_the_window(flight):
+def test_exposed_observations_are_those_of_batches_in_the_window():
     """Also where updates are rare, so that batches change and leave in the same one."""
     gone: list[int] = []
 
@@ -83,7 +88,7 @@ def test_exposed_observations_are_those_of_batches_in_the_window(flight):
         present = {id(b) for b in window.network.batches}
         gone.append(sum(key not in present for key in window._quality.integrity._of_batch))
 
-    result = adjust_online(*flight, OPTIONS, live=False, watch=watch, update_s=3.0)
+    result = adjust_online(*flown(3), OPTIONS, live=False, watch=watch, update_s=3.0)
     assert len(result.final) and not any(gone)
 
 

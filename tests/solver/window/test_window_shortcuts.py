@@ -154,7 +154,8 @@ def test_a_joined_batch_says_what_its_parts_said() -> None:
 def test_what_batches_keep_of_all_is_what_a_walk_over_them_gives() -> None:
     """While points come, looks are rejected, batches are joined and leave, over two strips."""
     plan = ObservationPlan(tie_points_per_s=6.0, outlier_share=0.05)
-    simulation = simulate(FlightPlan(strips=2, strip_s=20.0), 3, observation_plan=plan)
+    strips = FlightPlan(strips=2, strip_s=14.0, turns=False, gap_s=4.0, lead_in_s=3.0, lead_out_s=2.0)
+    simulation = simulate(strips, 3, observation_plan=plan)
     compared = 0
 
     def watch(_: float, window: Window) -> None:

@@ -98,7 +98,8 @@ def test_error_of_height_is_that_of_its_sigma_over_flights():
         mean, sigma = height_error(flight[0], adjust_at_once(*flight, OPTIONS, surface=surface).final_points)
         assert sigma < 0.45
         ratios.append(mean / sigma)
-        before.append(abs(height_error(flight[0], adjust_at_once(*flight, OPTIONS).final_points)[0]))
+        if seed < 24:  # of the flights themselves, whatever the surface does
+            before.append(abs(height_error(flight[0], adjust_at_once(*flight, OPTIONS).final_points)[0]))
     assert 0.55 < np.sqrt(np.mean(np.square(ratios))) < 1.5  # 12 draws
     assert np.sqrt(np.mean(np.square(before))) > 1.0
 
