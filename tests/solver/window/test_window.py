@@ -42,7 +42,7 @@ def flight():
 @pytest.fixture(scope="module")
 def adjusted(flight):
     """The flight adjusted with the usual options."""
-    return adjust_online(*flight)
+    return adjust_online(*flight, live=False, update_s=0.5)
 
 
 class Same(ModelOptions):
@@ -87,14 +87,14 @@ def test_a_window_that_lets_nothing_go_is_the_batch_adjustment(flight, model):
     end = simulation.flight.covered_s[-1, 1]
 
     def watch(now, window):
-        if now >= end - 0.2 and not seen:
+        if now >= end - 0.5 and not seen:
             strip = window.strips["S1"]
             seen["values"], seen["cov"] = window.state.values(strip.numbers), window.state.covariance(strip.numbers)
             seen["model"] = strip.model
             seen["rays"] = sum(b.counts.rays for b in window.network.batches)
             seen["points"] = {n: x for b in window.network.batches for n, x in zip(b.names, b.points_l, strict=True)}
 
-    adjust_online(simulation, smoothed, options, live=False, watch=watch)
+    adjust_online(simulation, smoothed, options, live=False, watch=watch, update_s=0.5)
     network = as_network(simulation, poses)
     solution = adjust(network, Same(seen["model"]))
     assert seen["rays"] == len(network.rays)
@@ -113,7 +113,8 @@ def test_a_window_that_lets_nothing_go_is_the_batch_adjustment(flight, model):
 def test_marginalisation_loses_nothing_and_invents_nothing(flight):
     simulation, poses = flight
     runs = [
-        adjust_online(simulation, poses, WindowOptions(window_s=w, snoop=False, settle_s=NEVER)) for w in (20.0, NEVER)
+        adjust_online(simulation, poses, WindowOptions(window_s=w, snoop=False, settle_s=NEVER), update_s=0.5)
+        for w in (20.0, NEVER)
     ]
     short, long = ({round(float(o.time_s[0]), 3): o for o in run.live if o.time_s[0] > 25.0} for run in runs)
     assert len(short) > 100 and short.keys() == long.keys()
@@ -205,7 +206,7 @@ def test_consistent_over_seeds_and_better_than_direct_georeferencing(seeds):
 
 def test_without_control_there_is_a_result_with_large_honest_sigma():
     simulation = simulate(PLAN, 5, observation_plan=replace(TIES, control=0))
-    result = adjust_online(simulation, navigate(simulation), update_s=0.5)
+    result = adjust_online(simulation, navigate(simulation), live=False, update_s=0.5)
     errors = orientation_errors(simulation, result.final)
     sigma = np.sqrt(np.einsum("nii->ni", errors.covariance))
     assert sigma[:, 0].min() > 0.3  # the datum rests on the a-priori offset
@@ -216,7 +217,7 @@ def test_without_control_there_is_a_result_with_large_honest_sigma():
 def test_without_any_tie_point_the_measured_trajectory_comes_back_with_its_sigma(flight):
     simulation, poses = flight
     nothing = replace(simulation, images=simulation.images.select(np.zeros(len(simulation.images), dtype=bool)))
-    result = adjust_online(nothing, poses, update_s=0.5)
+    result = adjust_online(nothing, poses, live=False, update_s=0.5)
     errors = orientation_errors(simulation, result.final)
     slow = slow_errors_of(simulation.errors)
     sigma = np.sqrt(errors.covariance[:, 0, 0])
@@ -339,7 +340,7 @@ def test_looks_of_a_time_without_poses_wait_for_smoothed_ones(flight, adjusted):
     begin_s = 12.0
     late = [p for p in poses if p.pose.smoothed or p.pose.time_s > begin_s]
     late = [replace(p, known_s=max(p.known_s, begin_s + 0.5)) if p.pose.smoothed else p for p in late]
-    waited = adjust_online(simulation, sorted(late, key=lambda p: p.known_s), live=False)
+    waited = adjust_online(simulation, sorted(late, key=lambda p: p.known_s), live=False, update_s=0.5)
     usual, used = (
         (sum(r.reason == "no orientation" for r in result.refused), len(result.final_points))
         for result in (adjusted, waited)
@@ -349,7 +350,8 @@ def test_looks_of_a_time_without_poses_wait_for_smoothed_ones(flight, adjusted):
 
 def test_what_is_final_stays_final(flight):
     simulation, poses = flight
-    result = adjust_online(simulation, poses)  # an own one: looks are added to its window
+    # an own one: looks are added to its window
+    result = adjust_online(simulation, poses, live=False, update_s=0.5)
     times = np.concatenate([o.time_s for o in result.final])
     assert (np.diff(times) > 0).all() and np.diff(times).max() == pytest.approx(0.05)
     strip = simulation.flight.strips[0]
@@ -377,10 +379,10 @@ def test_control_that_comes_late_still_counts(flight):
             sigma["before"] = window.live(27.9).covariance[0, 0, 0]
             for name in names:
                 window.add_control(name, given[name], np.full(3, 0.02), "control")
-        if abs(now - 28.4) < 0.05:
+        if abs(now - 28.5) < 0.05:
             sigma["after"] = window.live(27.9).covariance[0, 0, 0]
 
-    adjust_online(blind, poses, WindowOptions(window_s=NEVER), live=False, watch=watch)
+    adjust_online(blind, poses, WindowOptions(window_s=NEVER), live=False, watch=watch, update_s=0.5)
     assert sigma["after"] < 0.5 * sigma["before"]
 
 

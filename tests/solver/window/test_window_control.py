@@ -181,7 +181,7 @@ def flight():
     return simulation, navigate(simulation)
 
 
-def spoilt(flight, by, datum="control"):
+def spoilt(flight, by, datum="control", live=False):
     """A flight whose control is off by so many metres in height, by place in the order in which it is flown over."""
     simulation, poses = flight
     control = np.flatnonzero(simulation.points.role == "control")
@@ -191,7 +191,7 @@ def spoilt(flight, by, datum="control"):
     for place, metres in by.items():
         surveyed[control[place], 2] += metres
     options = WindowOptions(grid_hz=4.0, datum=datum)
-    online = adjust_online(replace(simulation, surveyed_l=surveyed), poses, options, update_s=0.5)
+    online = adjust_online(replace(simulation, surveyed_l=surveyed), poses, options, live=live, update_s=0.5)
     return online, [str(simulation.points.id[i]) for i in control]
 
 
@@ -215,7 +215,7 @@ def test_control_in_another_height_system_is_named_and_its_datum_published(fligh
 
 
 def test_control_in_another_height_system_is_refused_where_gnss_is_the_datum(flight):
-    online, names = spoilt(flight, dict.fromkeys(range(6), 47.0), datum="gnss")
+    online, names = spoilt(flight, dict.fromkeys(range(6), 47.0), datum="gnss", live=True)
     refused = [r for r in online.refused if r.reason == CONTRADICTS]
     assert {(r.point, r.coordinate) for r in refused} == {(name, "Z") for name in names}
     assert all(r.w > 5.0 and r.off_m == pytest.approx(47.0, abs=6.0) for r in refused)
