@@ -79,7 +79,8 @@ def test_strips_of_opposite_headings_find_the_lever_arm_in_window_and_batch():
         numbers = window.network.platform.numbers
         found.append((window.state.values(numbers), np.sqrt(np.diagonal(window.state.covariance(numbers)))))
 
-    adjust_online(simulation, poses, WindowOptions(grid_hz=4.0), live=False, watch=watch, platform=unknown)
+    options = WindowOptions(grid_hz=4.0)
+    adjust_online(simulation, poses, options, live=False, watch=watch, update_s=0.5, platform=unknown)
     network = network_of(simulation, poses)
     batch = run_batch(network, Job(WanderOptions(slow_errors_of(simulation.errors)), platform=unknown)).solution
     columns = batch.layout.platform_columns
@@ -111,8 +112,9 @@ def test_the_window_finds_the_clock(late):
         numbers = window.network.platform.numbers
         values.append((window.state.values(numbers)[0], window.state.covariance(numbers)[0, 0] ** 0.5))
 
-    online = adjust_online(simulation, poses, WindowOptions(grid_hz=4.0), live=False, watch=watch, platform=USUAL)
-    without = adjust_online(simulation, poses, WindowOptions(grid_hz=4.0), live=False)
+    options = WindowOptions(grid_hz=4.0)
+    online = adjust_online(simulation, poses, options, live=False, watch=watch, update_s=0.5, platform=USUAL)
+    without = adjust_online(simulation, poses, options, live=False, update_s=0.5)
     value, sigma = values[-1]
     assert sigma < 1.2e-3 and abs(value - CLOCK_S) < 3.5 * sigma
     assert any(event.startswith("clock: poses are stamped") for event in online.events)
