@@ -74,6 +74,16 @@ def usual():
     return run(f, stream(f))
 
 
+RARE = OnlineOptions(filtered_s=0.2, smooth_every_s=2.0)
+
+
+@pytest.fixture(scope="module")
+def rarely():
+    """The same fixes, and rare answers."""
+    f = flight()
+    return run(f, stream(f), InertialNavigator(FRAME, f.settings, MOUNT, RARE))
+
+
 def test_poses_come_at_once_and_smoothed_after_the_lag(usual):
     poses, nav = usual
     filtered, smoothed = split(poses)
@@ -88,10 +98,11 @@ def test_poses_come_at_once_and_smoothed_after_the_lag(usual):
 
 
 @pytest.mark.parametrize("nominal", [0.99, 1.01])
-def test_a_nominal_interval_is_no_scale_factor(usual, nominal):
+def test_a_nominal_interval_is_no_scale_factor(rarely, nominal):
     """No sensor is as fast as its data sheet says: samples last from stamp to stamp."""
     f = flight()
-    (_, smoothed), (_, usually) = split(run(f, stream(f), nominal=nominal)[0]), split(usual[0])
+    poses, _ = run(f, stream(f), InertialNavigator(FRAME, f.settings, MOUNT, RARE), nominal=nominal)
+    (_, smoothed), (_, usually) = split(poses), split(rarely[0])
     error, sigma = misses(f, smoothed[-2000:])
     usual_error, _ = misses(f, usually[-2000:])
     assert np.abs(error - usual_error).max(axis=0) == pytest.approx(np.zeros(6), abs=0.2 * sigma.min())
@@ -149,16 +160,18 @@ def test_late_and_disordered_fixes_change_next_to_nothing(usual):
     assert (np.abs(at_the_end[0].position_l - at_the_end[1].position_l) < 0.05 * sigma[:3]).all()
 
 
-@pytest.mark.parametrize("latency", [lambda i: 0.1, lambda i: 0.013 if i % 5 else 1.2, lambda i: -0.3])
-def test_rare_answers_are_those_of_all_answers(usual, latency):
+@pytest.mark.parametrize("latency", [None, lambda i: 0.013 if i % 5 else 1.2, lambda i: -0.3])
+def test_rare_answers_are_those_of_all_answers(usual, rarely, latency):
     f = flight()
-    rare = OnlineOptions(filtered_s=0.2, smooth_every_s=2.0)
-    poses, nav = run(f, stream(f, latency=latency), InertialNavigator(FRAME, f.settings, MOUNT, rare))
+    if latency is None:
+        poses, nav = rarely
+    else:
+        poses, nav = run(f, stream(f, latency=latency), InertialNavigator(FRAME, f.settings, MOUNT, RARE))
     assert not nav.counters
     (all_filtered, all_smoothed), (filtered, smoothed) = split(usual[0]), split(poses)
     assert len(smoothed) == pytest.approx(len(all_smoothed), rel=0.02)  # a fix between two samples makes a pose or not
-    assert np.diff([p.time_s for p in filtered]).min() > 0.2 - 1e-6
-    assert len(filtered) > 0.1 * f.inertial.time_s[-1] / rare.filtered_s
+    assert np.diff([p.time_s for p in filtered]).min() > RARE.filtered_s - 1e-6
+    assert len(filtered) > 0.1 * f.inertial.time_s[-1] / RARE.filtered_s
     assert len(filtered) < len(all_filtered) / 5
     reference = {p.time_s: p for p in all_smoothed if p.time_s > 40.0}
     pairs = [(reference[p.time_s], p) for p in smoothed if p.time_s in reference]
@@ -210,7 +223,8 @@ def test_inertial_gap_is_bridged_and_a_long_one_aligns_anew():
 def test_restarted_in_flight_it_aligns_again():
     f = flight()
     events = [e for e in stream(f) if e[0] > 40.0]
-    poses, _ = run(f, events)
+    options = OnlineOptions(filtered_s=0.1, smooth_every_s=2.0)
+    poses, _ = run(f, events, InertialNavigator(FRAME, f.settings, MOUNT, options))
     filtered, _ = split(poses)
     first = next(p.time_s for p in filtered if p.valid)
     assert not filtered[0].valid and filtered[0].reason.startswith("aligning") and 43.0 < first < 75.0
@@ -236,7 +250,8 @@ def test_a_wrong_initial_heading_is_found_out():
 def test_gnss_outage_drift_and_validity():
     f = flight("mems")
     events = [e for e in stream(f) if not (e[1] == 1 and 60.0 < f.gnss.time_s[e[2]] < 90.0)]
-    nav = InertialNavigator(FRAME, f.settings, MOUNT, OnlineOptions(valid_position_m=0.5))
+    options = OnlineOptions(filtered_s=0.1, smooth_every_s=2.0, valid_position_m=0.5)
+    nav = InertialNavigator(FRAME, f.settings, MOUNT, options)
     poses, _ = run(f, events, nav)
     filtered, _ = split(poses)
     during = [p for p in filtered if 61.0 < p.time_s < 90.0]

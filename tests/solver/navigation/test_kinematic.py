@@ -14,6 +14,7 @@ from triline.solver.geometry.rotation import (
 )
 from triline.solver.navigation.kinematic import KinematicFilter
 from triline.solver.navigation.kinematic_model import N_STATES, KinematicOptions, quintic, transition
+from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import simulate
 from triline.solver.simulation.window_study import measured_errors, navigate, slow_errors_of
@@ -104,7 +105,7 @@ def test_the_filter_is_consistent_and_smoothing_helps():
     values = {False: [], True: []}
     rmse = {False: [], True: []}
     for seed in range(4):
-        simulation = simulate(FlightPlan(strip_s=20.0), seed)
+        simulation = simulate(FlightPlan(strip_s=20.0), seed, ErrorModel(attitude_rate_hz=50.0))
         poses = navigate(simulation)
         slow = slow_errors_of(simulation.errors)
         for smoothed, list_ in values.items():
@@ -121,7 +122,8 @@ def test_the_filter_is_consistent_and_smoothing_helps():
 def test_the_covariance_owns_up_to_the_slow_gnss_error():
     nees = []
     for seed in range(12):
-        simulation = simulate(FlightPlan(strip_s=12.0, lead_in_s=4.0, lead_out_s=1.0), 100 + seed)
+        plan = FlightPlan(strip_s=12.0, lead_in_s=4.0, lead_out_s=1.0)
+        simulation = simulate(plan, 100 + seed, ErrorModel(attitude_rate_hz=50.0))
         errors = measured_errors(simulation, navigate(simulation), True)
         nees.append(errors.nees.mean())
     assert 0.6 < np.mean(nees) < 1.5
