@@ -129,7 +129,7 @@ def test_the_operator_is_told_what_the_result_rests_on(done, flight):
     texts = [b.message for b in bodies(done[1], "event/log")]
     assert texts[0] == "strip S1 began" and "strip S1 ended" in texts
     assert any(t.startswith("weak: no tie points") for t in texts) and "good" in texts
-    blind = run(Adjuster(grid_hz=10.0), [x for x in flight[1] if x.topic != "observation/control"])
+    blind = run(Adjuster(grid_hz=2.0), [x for x in flight[1] if x.topic != "observation/control"])
     last = [b.message for b in bodies(blind, "event/log") if b.message.startswith(("good", "weak", "failed"))]
     assert "good" not in last[:-1]
     assert any("datum rest on GNSS" in text for text in last), "the reason has changed under a light that has not"
@@ -237,14 +237,14 @@ def test_invalid_poses_make_invalid_orientation(flight):
             body.valid, body.reason = False, "no GNSS for 3.0 s"
             x = Message(x.topic, x.stamp_ns, body)
         messages.append(x)
-    outputs = run(Adjuster(grid_hz=10.0), messages)
+    outputs = run(Adjuster(grid_hz=10.0, update_s=0.5), messages)
     for topic in ("orientation/live", "orientation/final"):
         invalid = [p for p in bodies(outputs, topic) if not p.valid]
         assert 8 <= len(invalid) <= 12 and all(p.reason == "no GNSS for 3.0 s" for p in invalid)
 
 
 def test_an_imported_trajectory_without_filter_output_works_too(flight):
-    outputs = run(Adjuster(grid_hz=10.0), [x for x in flight[1] if x.topic != "trajectory/filtered"])
+    outputs = run(Adjuster(grid_hz=10.0, update_s=0.5), [x for x in flight[1] if x.topic != "trajectory/filtered"])
     assert len(bodies(outputs, "orientation/live")) > 250
     assert len(bodies(outputs, "orientation/final")) > 270
 
@@ -311,7 +311,7 @@ def test_every_look_that_a_test_refused_has_its_w(flight):
             body.images[0].sample += rng.choice([-1.0, 1.0]) * rng.uniform(10.0, 80.0)
             message = replace(message, body=body)
         messages.append(message)
-    outputs = run(Adjuster(grid_hz=2.0), messages)
+    outputs = run(Adjuster(grid_hz=2.0, update_s=0.5), messages)
     rejected = [r for body in bodies(outputs, "adjustment/report") for r in body.rejected if r.reason == "snooping"]
     assert len(rejected) > 20 and all(r.w > 0.0 for r in rejected)
     assert np.median([r.w for r in rejected]) > 5.0
@@ -327,7 +327,7 @@ def test_control_that_comes_or_changes_in_flight_is_told(done, flight):
     changed.CopyFrom(mine[1].body)
     changed.z += 0.5
     news = [replace(mine[0], stamp_ns=late), Message("observation/control", late, changed)]
-    said = [text for text, _ in lines(run(Adjuster(grid_hz=2.0), rest[:first] + news + rest[first:]))]
+    said = [text for text, _ in lines(run(Adjuster(grid_hz=2.0, update_s=0.5), rest[:first] + news + rest[first:]))]
     assert f"control came in flight: {mine[0].body.point}" in said
     assert f"control changed in flight: {changed.point} by 0.00, 0.00, 0.50 m" in said
     assert not [text for text, _ in lines(done[1]) if "in flight" in text]
@@ -358,7 +358,7 @@ def test_a_strip_joined_in_its_middle_says_so_and_begins_there(done, flight):
     joined = start + 15 * convert.SECOND_NS
     known = ("configuration/", "observation/control")
     late = [x for x in flight[1] if x.topic.startswith(known) or x.stamp_ns >= joined]
-    node = Adjuster(grid_hz=2.0)
+    node = Adjuster(grid_hz=2.0, update_s=0.5)
     outputs = run(node, late)
     said = [text for text, _ in lines(outputs) if "joined" in text]
     assert len(said) == 1 and said[0].startswith("strip S1 is joined 1") and "neither final nor whole" in said[0]
@@ -383,7 +383,7 @@ def test_another_project_in_flight_starts_the_window_again_and_live_orientation_
             body.valid, body.reason = False, "aligning"
             x = replace(x, body=body)
         spoilt.append(x)
-    node = Adjuster(grid_hz=10.0)
+    node = Adjuster(grid_hz=10.0, update_s=0.5)
     outputs = run(node, [*spoilt, again, *messages[k:]])
     times = np.array([seconds(p) for p in bodies(outputs, "orientation/live")])
     grid = np.unique(times[np.abs(10 * times - np.round(10 * times)) < 1e-6].round(6))

@@ -66,7 +66,7 @@ def test_orientation_errors_equal_an_independent_computation(messages, recording
         rows = np.array(rows)
         found = result["orientation"][name]
         rmse = np.sqrt((rows**2).mean(axis=0))
-        # the filtered trajectory is evaluated at 200 Hz, the independent figure at the 20 Hz of the truth
+        # the filtered trajectory is evaluated at 100 Hz, the independent figure at the 20 Hz of the truth
         tolerance = 0.01 if name == "filtered" else 1e-9
         np.testing.assert_allclose(found["rmse_m"], rmse[:3], rtol=tolerance)
         np.testing.assert_allclose(np.radians(found["rmse_deg"]), rmse[3:], rtol=tolerance)

@@ -136,7 +136,7 @@ def test_reports_that_are_as_far_apart_as_the_pace_for_throughput_makes_them(mes
     assert max(box.x1 for box in shades) == pytest.approx(start + 17.0, abs=0.1)
 
 
-def test_the_page_has_a_section_with_figure_and_units(messages, tmp_path):
+def test_the_page_has_a_section_with_figure_and_units(messages, tmp_path, request):
     path = write_recording(tmp_path / "flight.mcap", messages)
     target = tmp_path / "report.html"
     assert main(["analyze", str(path), "-o", str(target), "-q"]) == 0
@@ -147,6 +147,7 @@ def test_the_page_has_a_section_with_figure_and_units(messages, tmp_path):
     assert section.count("<svg") == 1 and "protection level, median" in section and "κ [mdeg]" in section
     assert re.search(r"1\.00 m \(median\); below the alert limit of 2\.00 m in (69|7[0-2]) % of", section)
     assert "matcher/B" in section and "-0.20" in section
+    request.getfixturevalue("undrawn")
     plain = write_recording(tmp_path / "plain.mcap", flight_messages(seconds=12.0, points=20))
     assert main(["analyze", str(plain), "-o", str(target), "-q"]) == 0
     assert "<h2>Integrity</h2>" not in target.read_text()
@@ -168,6 +169,7 @@ def test_what_is_said_again_of_a_whole_strip_replaces_what_was_said_before(messa
     np.testing.assert_allclose(whole.position_l - before.position_l, [[0.25, 0.0, 0.0]] * len(whole), atol=1e-9)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_coordinates_of_a_control_point_are_refused_one_by_one():
     """They have no image point, so that only the coordinate tells them apart; the table shows no line 0."""
     refused = [
