@@ -257,7 +257,7 @@ def test_poses_that_are_not_valid_are_told(folder, tmp_path):
 def test_flight_is_adjusted_as_its_project_states_it(tmp_path):
     """Wander and the white noise of the poses are the project's: image points do not get the blame for either."""
     flight, smoothed = tmp_path / "flight.mcap", tmp_path / "smoothed.mcap"
-    assert main(["simulate", "-o", str(flight), "--seconds", "30", "-q"]) == 0
+    assert main(["simulate", "-o", str(flight), "--seconds", "30", "--attitude-rate", "50", "-q"]) == 0
     assert main(["process", str(flight), "-o", str(smoothed), "--nodes", "navigator", "-q"]) == 0
     assert adjust(smoothed, "-q", "-o", tmp_path / "out") == 0
     result = result_in(tmp_path / "out")
@@ -282,8 +282,8 @@ def test_flight_is_adjusted_as_its_project_states_it(tmp_path):
 def test_image_points_in_a_gap_of_the_trajectory_have_no_orientation(tmp_path):
     """Six seconds without attitudes, in turbulence: an orientation across them would be off by tenths of a degree."""
     flight, gap = tmp_path / "flight.mcap", tmp_path / "gap.mcap"
-    words = ["simulate", "-o", str(flight), "--seconds", "40", "--seed", "3", "--turbulence", "3", "-q"]
-    assert main(words) == 0
+    words = ["simulate", "-o", str(flight), "--seconds", "40", "--seed", "3", "--attitude-rate", "50"]
+    assert main([*words, "--turbulence", "3", "-q"]) == 0
     reader = RecordingReader(flight)
     first_ns = reader.first("configuration/strip").first_line_time_ns
     begin, end = first_ns + 18 * 10**9, first_ns + 24 * 10**9
@@ -317,7 +317,7 @@ def test_what_an_inertial_filter_does_not_know_is_no_noise_of_single_poses(tmp_p
 @pytest.mark.parametrize("noise", ["t3", "normal"])
 def test_heavy_tails_are_told(tmp_path, noise):
     flight = tmp_path / "flight.mcap"
-    words = ["--true", "tie-noise=t3"] if noise == "t3" else []
+    words = ["--attitude-rate", "50", *(["--true", "tie-noise=t3"] if noise == "t3" else [])]
     assert main(["simulate", "-o", str(flight), "--seconds", "40", "--ties", "10", *words, "-q"]) == 0
     assert main(["process", str(flight), "-o", str(tmp_path / "s.mcap"), "--nodes", "navigator", "-q"]) == 0
     assert adjust(tmp_path / "s.mcap", "--snoop", "-q", "-o", tmp_path / "out") == 0

@@ -20,23 +20,6 @@ TRILINE = [sys.executable, "-m", "triline.nodes.cli"]
 ADJUST = ("--do", "adjust", "--workers", "2")
 
 
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory):
-    """A short flight."""
-    path = tmp_path_factory.mktemp("flown") / "flown.mcap"
-    plan = ("--seconds", "8", "--lead-in", "1", "--lead-out", "0.5", "--seed", "2")
-    assert main(["simulate", "-o", str(path), *plan, "-q"]) == 0
-    return path
-
-
-@pytest.fixture(scope="module")
-def adjustable(flown):
-    """The same, with a trajectory."""
-    path = flown.with_name("adjustable.mcap")
-    assert main(["process", str(flown), "-o", str(path), "-q"]) == 0
-    return path
-
-
 @pytest.fixture
 def season(adjustable, tmp_path, monkeypatch):
     """A folder with three flights; the working folder is the one above it."""

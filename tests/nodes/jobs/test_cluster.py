@@ -83,15 +83,6 @@ def processes(words: str) -> dict[int, int]:
     return found
 
 
-@pytest.fixture(scope="module")
-def adjustable(tmp_path_factory):
-    path = tmp_path_factory.mktemp("flown") / "flown.mcap"
-    plan = ("--seconds", "8", "--lead-in", "1", "--lead-out", "0.5", "--seed", "2")
-    assert main(["simulate", "-o", str(path), *plan, "-q"]) == 0
-    assert main(["process", str(path), "-o", str(path.with_name("f0.mcap")), "-q"]) == 0
-    return path.with_name("f0.mcap")
-
-
 @pytest.fixture
 def season(adjustable, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
