@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from ..arrays import Array, Bools
 from ..models.base import ModelOptions
@@ -106,13 +107,19 @@ def _through_trajectory(
         information = np.asarray(B.multiply(B).sum(axis=0)).ravel()
         variance = np.divide(1.0, information, out=np.zeros_like(information), where=information > 0)
         spread = np.asarray(M.multiply(M) @ variance).ravel()
-    else:  # continuity binds the unknowns of a set, never those of two
+    else:  # continuity binds unknowns of one component of a set, never those of two
         spread = np.zeros(shape[0])
-        by_column, normal = M.tocsc(), prior.normal.tocsc()
-        for item in layout.sets:
-            own = csr_array(by_column[:, item.columns])
-            covariance = _pseudo_inverse(normal[item.columns, item.columns].toarray())
-            spread += np.asarray(own.multiply(own @ covariance).sum(axis=1)).ravel()
+        by_column, normal = M.tocsc(), prior.normal.tocsr()
+        count, group = connected_components(normal, directed=False)
+        order = np.argsort(group, kind="stable")
+        for columns in np.split(order, np.cumsum(np.bincount(group, minlength=count))[:-1]):
+            own = csr_array(by_column[:, columns])
+            rows = np.flatnonzero(np.diff(own.indptr))
+            if not len(rows):  # no error of the trajectory
+                continue
+            own = own[rows]
+            covariance = _pseudo_inverse(normal[columns][:, columns].toarray())
+            spread[rows] += np.asarray(own.multiply(own @ covariance).sum(axis=1)).ravel()
     return spread.reshape(-1, 3)
 
 
