@@ -160,6 +160,10 @@ def _run(argv: list[str], job: bool) -> int:
         if frames is not None and isinstance(error, frames.CrsError):
             print(f"{name}: {plain(error, LONGEST_LINE)}", file=sys.stderr)
             return 1
+        if "Cannot find proj.db" in str(error):  # GDAL's PROJ takes one folder, where that of pyproj takes several
+            said = os.environ.get("PROJ_DATA") or os.environ.get("PROJ_LIB") or "not set"
+            print(f"{name}: no proj.db in PROJ_DATA ({said}): wanted one folder that has it, or none", file=sys.stderr)
+            return 1
         if verbose:
             raise
         what = " ".join(f"{type(error).__name__}: {error}".split())

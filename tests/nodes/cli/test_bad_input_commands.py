@@ -287,7 +287,12 @@ def test_what_a_command_cannot_help_is_one_line(tmp_path, capsys, monkeypatch):
     import triline.nodes.cli.simulate as module
 
     path = tmp_path / "a.mcap"
+    monkeypatch.setenv("PROJ_DATA", "/grids:/proj")
     for error, text in (
+        (
+            ValueError("PROJ: internal_proj_create_from_database: Cannot find proj.db"),
+            "triline simulate: no proj.db in PROJ_DATA (/grids:/proj): wanted one folder that has it, or none",
+        ),
         (
             OSError(28, "No space left on device"),
             f"triline simulate: {path}: cannot be written: no space left on device",
