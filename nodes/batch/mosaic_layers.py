@@ -76,7 +76,7 @@ class Layer:
     def read(cls, path: Path) -> Layer:
         found = read_json(path)
         found["tiles"] = [tuple(tile) for tile in found["tiles"]]
-        found |= {name: tuple(found[name]) for name in ("descriptions", "scales", "offsets", "units")}
+        found |= {name: tuple(found.get(name, ())) for name in ("descriptions", "scales", "offsets", "units")}
         return cls(**found)
 
 

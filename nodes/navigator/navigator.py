@@ -97,6 +97,7 @@ class Navigator(Node):
         self._covariance = np.zeros((3, 3))
         self._clock = ClockCheck()
         self._newest_ns, self._other = 0, "attitude"
+        self._inertial_came = False
         self._early_fix_ns = 0  # newest fix before the first attitude or inertial sample
         self._last_fix, self._period_s = (-1, 0), 0.0
         self._suspect: int | None = None
@@ -243,8 +244,9 @@ class Navigator(Node):
         self._note_time(body.time_ns, "inertial")
         force, rate = (body.force_x, body.force_y, body.force_z), (body.rate_x, body.rate_y, body.rate_z)
         interval_ns = body.interval_ns
-        if not interval_ns and not isinstance(self._engine, InertialNavigator):
-            return []  # the first of a bag, where nobody knows since when it measured; the next one tells
+        first, self._inertial_came = not self._inertial_came, True
+        if first and not interval_ns:
+            return []  # of a bag: nobody knows since when it measured, and the next one measured since then
         convert.check_inertial(interval_ns, force, rate)
         if not isinstance(self._engine, InertialNavigator):
             self._engine = inertial_engine(

@@ -93,7 +93,6 @@ class SigmaCheck:
 
     def settled(self, now_s: float) -> bool:
         """Whether no sigma has been stated anew lately, and there are looks enough to tell their noise."""
-        self._tells = self._tells or len(self._looks.controlled()) >= LEAST_LOOKS
         return self._tells and now_s > self._changed_s + SETTLED_S
 
     def look(self, now_s: float, due: bool, turns: int = 1) -> tuple[bool, bool]:
@@ -112,6 +111,7 @@ class SigmaCheck:
         strip = next((s for s in reversed(network.flown) if s.first_line_time_s <= now_s), None)
         if strip is None or not len(network.batches):
             return False, False
+        self._tells = self._tells or len(self._looks.controlled()) >= LEAST_LOOKS
         network.state.solve()
         network.state.expect([network.state.numbers])
         if network.platform.question(PLATFORM_QUESTIONED):

@@ -12,6 +12,7 @@ import rasterio
 from block_of_orthoimages import GSD, LEFT, TOP, make_block
 from rio_cogeo.cogeo import cog_validate
 
+from triline.nodes.batch.mosaic_layers import Layer
 from triline.nodes.cli import main
 from triline.nodes.formats.geotiff import Raster, TilePlace, write_tile, write_virtual
 
@@ -360,6 +361,18 @@ def test_a_mosaic_says_what_the_values_of_its_orthoimages_mean(tmp_path, capsys)
     assert main(words) == 1
     wanted = "scales of its bands: 0.001, 1.0, but ortho0 has 0.0001, 1.0: wanted values that mean the same"
     assert wanted in capsys.readouterr().err
+
+
+def test_a_layer_that_an_earlier_version_kept_is_read(tmp_path):
+    """It says nothing of what its values mean."""
+    path = tmp_path / "0.json"
+    layer = Layer("A", "", "a.tif", "a.steepness.tif", None, 0, 0, 4, 4, 1, "uint8", 0.0, [(0, 0)], {})
+    layer.write(path)
+    kept = json.loads(path.read_text())
+    for name in ("descriptions", "scales", "offsets", "units"):
+        del kept[name]
+    path.write_text(json.dumps(kept))
+    assert Layer.read(path) == layer
 
 
 @pytest.mark.parametrize("crs", ["EPSG:3035", "EPSG:2193", "EPSG:32632", "EPSG:25832+7837"])

@@ -276,6 +276,14 @@ def test_bad_samples_are_counted_and_bridged(short, changes, said, filtered_s):
     assert last_errors(out, truth).mean() < 4.0
 
 
+def test_samples_without_an_interval_are_counted_but_for_the_first_one(short):
+    """A unit that never says how long it measured is not left out without a word."""
+    messages = [x for x in short[0] if x.topic == "configuration/project"]
+    node, samples = Navigator(), [short[0][i] for i in inertial(short[0])[:20]]
+    run(node, messages + [damaged(x, interval_ns=0) for x in samples])
+    assert node.counters["malformed"] == 19 and "interval 0 ns" in node.last_problem
+
+
 def test_duplicates_and_disorder_of_samples_change_nothing(short):
     messages = [x for x in short[0] if x.stamp_ns < EPOCH + 28 * convert.SECOND_NS]  # aligned for 9 s
     clean, node, rows = Navigator(), Navigator(), inertial(messages)

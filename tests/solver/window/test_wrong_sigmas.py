@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -237,7 +238,7 @@ def test_a_wander_falls_where_noise_of_looks_was_taken_for_it(camera_network, mo
     strip = strip_in(state)
     stated = strip.apriori()[3]
     camera_network.strips["S1"], camera_network.sigmas.image = strip, image
-    monkeypatch.setattr(camera_network, "batches", [None])
+    monkeypatch.setattr(camera_network, "batches", [SimpleNamespace(judged=None)])
     for factor in (5.0, 1.0):
         monkeypatch.setattr(check, "_slow_errors", lambda *_, f=factor: (np.full(4, f), False))
         check.look(9.0, due=True)
