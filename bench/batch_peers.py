@@ -140,12 +140,15 @@ def compare(name: str, peer: Path | None, folder: Path, repeat: int) -> dict:
         self_calibration=aps,
         camera_parameters=errors,
     ).network
-    ours = []
+    ours: list[float] = []
+    problem = solution = None
     for _ in range(repeat):
         start = time.perf_counter()
         problem = pose_problem(network, options, aps)
         solution = solve(problem)
         ours.append(time.perf_counter() - start)
+    if problem is None or solution is None:
+        raise ValueError("wanted at least one run")
     row = {
         "case": name,
         "rays": len(network.rays),

@@ -25,6 +25,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import frame
 import numpy as np
@@ -198,7 +199,7 @@ def one_adjustment(seed: int, case: Case) -> dict[str, np.ndarray]:
     }
 
 
-def run(case: Case, seeds: int, one_by_one: bool = False) -> dict[str, object]:
+def run(case: Case, seeds: int, one_by_one: bool = False) -> dict[str, Any]:
     """A row of the table; on the way, where asked for, what it is after each flight."""
     flights = []
     for flight in frame.over_seeds(partial(one_flight, case=case), seeds):

@@ -208,7 +208,7 @@ class Programs:
 
 
 @contextmanager
-def everything(network: Network, folder: Path, limit: float) -> Iterator[tuple[Programs, dict[str, Any]]]:
+def everything(network: Network, folder: Path, limit: float) -> Iterator[tuple[Programs, dict[Any, Any]]]:
     """Places, links, certificates, routers, the ground's recorder, and the nodes of each aircraft."""
     keys = folder / "survey"
     nets = {aircraft: i + 1 for i, aircraft in enumerate(STATIONS)}
@@ -231,7 +231,7 @@ def everything(network: Network, folder: Path, limit: float) -> Iterator[tuple[P
         frame.triline("keys", "aircraft", aircraft, "--authority", str(keys), "--router", router)
     frame.triline("keys", "desk", "ann", "--authority", str(keys), "--router", "127.0.0.1")
     with Programs(network, folder) as programs:
-        running: dict[str, Any] = {"nets": nets, "keys": keys}
+        running: dict[Any, Any] = {"nets": nets, "keys": keys}
         for router in ("office", *up):
             running[router] = programs.start(
                 router, f"router-{router}", [*TRILINE, "node", "router", "--secure", str(keys / router)]

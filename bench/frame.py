@@ -62,7 +62,7 @@ def mean_and_band(values: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     return rows.mean(axis=0), 1.96 * rows.std(axis=0, ddof=1) / np.sqrt(len(rows))
 
 
-def banded(mean: float, half_width: float) -> str:
+def banded(mean: float | np.ndarray, half_width: float | np.ndarray) -> str:
     """A mean that should be 1, with its band, and whether 1 lies in it."""
     return f"{mean:.3f} +- {half_width:.3f}  {'in the band' if abs(mean - 1.0) <= half_width else 'outside'}"
 

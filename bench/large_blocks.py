@@ -230,8 +230,8 @@ def kill(given: argparse.Namespace) -> int:
     answers = []
     for killing in (False, True):
         cluster = LocalCluster(
-            given.workers, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
-            silence_logs=50,
+            given.workers, threads_per_worker=1, processes=True, host="127.0.0.1", silence_logs=50,
+            dashboard_address=None,  # pyright: ignore[reportArgumentType]
         )  # fmt: skip
         over, killed = threading.Event(), []
 

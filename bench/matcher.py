@@ -183,7 +183,7 @@ def _compare_one(data: dict, rows: dict[str, list], spent: dict[str, float]) -> 
     rows["Lucas-Kanade"].append(np.where(good, np.hypot(*((there - at)[:, ::-1] - true_shift).T), np.nan))
 
     begin = time.process_time()
-    orb = cv2.ORB_create(8000)
+    orb = cv2.ORB.create(8000)
     keys_a, d_a = orb.detectAndCompute(a8, None)
     keys_b, d_b = orb.detectAndCompute(b8, None)
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(d_a, d_b)

@@ -142,7 +142,7 @@ def accuracy(grade, name: str, seeds: int, wanted=None) -> bool:
     if wanted is not None:
         good &= bool((rms[0][:3] * 1e3 <= wanted[0]).all() and (np.degrees(rms[0][6:]) <= wanted[1]).all())
         good &= bool((gain[:3] >= 1.5).all() and gain[8] >= 1.5)
-    return good and abs(np.mean(nis) - 1.0) < 0.1
+    return good and bool(abs(np.mean(nis) - 1.0) < 0.1)
 
 
 def outage() -> bool:

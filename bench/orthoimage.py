@@ -68,7 +68,7 @@ def rate(lines: int) -> bool:
     print(f"{lines} lines of {PIXELS} px, cells of {grid.gsd} m, heading 30 deg, relief +-75 m")
     ours = {}
     for method in ("nearest", "bilinear", "cubic"):
-        best = np.inf
+        best, longest = np.inf, 0.0
         for _ in range(3):
             begun = time.process_time()
             rectifier, mosaic, longest = StripRectifier(rays_of(camera, ccd), field, grid, method), Mosaic(), 0.0

@@ -47,7 +47,7 @@ def of_seed(grade: str, seed: int, strip_s: float, strips: int) -> list[tuple[Sl
 
     def take(made: list[Message]) -> None:
         for m in (m for m in made if m.topic.startswith("trajectory/")):
-            sample, is_smoothed = convert.pose_sample(m.body), m.topic.endswith("smoothed")
+            sample, is_smoothed = convert.plain_pose(m.body), m.topic.endswith("smoothed")
             time_s = (sample.time_ns - EPOCH) * 1e-9
             poses.add(time_s, sample, is_smoothed, "")
             if is_smoothed:

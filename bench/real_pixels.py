@@ -34,7 +34,7 @@ from pathlib import Path
 import frame
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from triline.nodes.formats.height_raster import HeightRaster
 from triline.nodes.formats.satellite.read import read_scene
@@ -180,7 +180,7 @@ def across_line(pixel: Array, shift: Array, parallax: Array, z: Array) -> tuple[
     base = np.linalg.norm(parallax, axis=1)
     normal = np.column_stack([-parallax[:, 1], parallax[:, 0]]) / base[:, None]
     height = z + np.einsum("ki,ki->k", shift, parallax) / base**2
-    _, near = cKDTree(pixel).query(pixel, NEIGHBOURS + 1)
+    near = np.asarray(KDTree(pixel).query(pixel, NEIGHBOURS + 1)[1])
     off = np.abs(height - np.median(height[near[:, 1:]], axis=1)) > WRONG_M
     distance = np.einsum("ki,ki->k", shift, normal)
     design = np.column_stack([np.ones(len(pixel)), pixel / 250.0 - 1.0, (height - HEIGHT_M) / 100.0])

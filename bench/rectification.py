@@ -61,7 +61,7 @@ def make_scene(folder: Path, lines: int, samples: int) -> dict[str, str]:
             n = min(512, lines - row)
             grain = rng.integers(0, 300, (n, samples), dtype=np.uint16)
             wave = 800 + 300 * np.sin(np.arange(samples) / 17.0)[None] * np.cos((row + np.arange(n)) / 23.0)[:, None]
-            target.write((grain + wave).astype(np.uint16), 1, window=Window(0, row, samples, n))
+            target.write((grain + wave).astype(np.uint16), 1, window=Window(0, row, samples, n))  # pyright: ignore[reportCallIssue]
     write_rpb(folder / "image.RPB", rpc)  # last: a new image takes what stands beside the old one away
     return {"image": str(folder / "image.tif"), "rpc": str(folder / "image.RPB"), "dem": str(folder / "heights.tif")}
 
@@ -129,6 +129,7 @@ def work_alone(job: dict) -> int:
 
 def speed(folder: Path, lines: int, samples: int, workers: int) -> tuple[dict, bool]:
     import rasterio
+    from rasterio.windows import Window
 
     scene = make_scene(folder, lines, samples)
     job = {**scene, "workers": workers, "like": str(folder / "plain.tif")}
@@ -137,7 +138,8 @@ def speed(folder: Path, lines: int, samples: int, workers: int) -> tuple[dict, b
     whole = alone("triline", {**job, "out": str(folder / "cog.tif"), "more": []})
     with rasterio.open(folder / "plain.tif") as one, rasterio.open(folder / "gdal.tif") as two:
         cells = one.width * one.height
-        middle = rasterio.windows.Window(one.width // 2 - 500, one.height // 2 - 500, 1000, 1000)
+        corner = one.width // 2 - 500, one.height // 2 - 500
+        middle = Window(*corner, 1000, 1000)  # pyright: ignore[reportCallIssue]
         a, b = one.read(1, window=middle).astype(float), two.read(1, window=middle).astype(float)
     known = (a > 0) & (b > 0)
     rows = {}
