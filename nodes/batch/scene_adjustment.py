@@ -127,13 +127,11 @@ def run_scene_job(data: SceneBlockData, job: SceneJob) -> SceneAdjustment:
             sensors: list[PushbroomSensor | None] = [
                 e.location if isinstance(e.location, PushbroomSensor) else None for e in data.images
             ]
-            first, second = step_settings(data.trajectory_settings(), data.then, job.model, job.then, job.given)
-            model, then = _model(data, job.model, first), None if job.then is None else _model(data, job.then, second)
-            problem, solution, found = _stage(data, job, model, sensors)
+            problem, solution, found = _stage(data, job, sensors)
             before = None
-            if then is not None:
+            if job.then is not None:
                 before, sensors = (problem, solution), _corrected(problem, solution, sensors)
-                problem, solution, found = _stage(data, job, then, sensors, refined=not sigmas_stated(data.then))
+                problem, solution, found = _stage(data, job, sensors, second=True)
     except NotAdjustableError as error:
         raise UserError(f"{data.name}: {error}") from None
     except ValueError as error:
@@ -143,13 +141,9 @@ def run_scene_job(data: SceneBlockData, job: SceneJob) -> SceneAdjustment:
 
 
 def _stage(
-    data: SceneBlockData,
-    job: SceneJob,
-    model: ModelOptions,
-    sensors: Sequence[PushbroomSensor | None],
-    refined: bool = False,
+    data: SceneBlockData, job: SceneJob, sensors: Sequence[PushbroomSensor | None], second: bool = False
 ) -> tuple[Problem, SceneSolution, SceneSnooping | None]:
-    problem = prepare(data.block(images_of(data, job, model, sensors, refined)))
+    problem = prepare(data.block(images_of(data, job, sensors, second)))
     solution = adjust(problem, max_iterations=job.iterations)
     if not job.snoop:
         return problem, solution, None
@@ -171,13 +165,11 @@ def _corrected(
 
 
 def images_of(
-    data: SceneBlockData,
-    job: SceneJob,
-    options: ModelOptions,
-    sensors: Sequence[PushbroomSensor | None],
-    refined: bool = False,
+    data: SceneBlockData, job: SceneJob, sensors: Sequence[PushbroomSensor | None], second: bool = False
 ) -> tuple[ImageModel, ...]:
-    """The images of a block with their unknowns; ``refined``: see `CorrectionSet`."""
+    """The images of a block with their unknowns, those of the second of two steps if ``second``."""
+    refined = second and not sigmas_stated(data.then)  # see `CorrectionSet`
+    _model(data, job, data.images, second)  # refuses settings also where no image takes them
     spans = [None if s is None else _span(s) for s in sensors]
     shared: dict[str, CorrectionSet] = {}
     images: list[ImageModel] = []
@@ -198,6 +190,7 @@ def images_of(
             extent = Extent(f"strip {key}", *whole, times if any(rays) else np.empty(0), np.empty(0),
                             job.self_calibration != "none")  # fmt: skip
             axes_b = flight_axes_b(sensor, 0.5 * sum(whole))
+            options = _model(data, job, [data.images[i] for i in mine], second)
             shared[key] = CorrectionSet(key, options.build(extent), axes_b, refined)
         images.append(RigorousImage(entry.name, sensor, shared[key], _calibration(data.images[k], sensor, job)))
     return tuple(images)
@@ -215,9 +208,12 @@ def _calibration(entry: ImageEntry, sensor: PushbroomSensor, job: SceneJob) -> A
     return calibration_of(key, sensor, entry.view, make)
 
 
-def _model(data: SceneBlockData, model: str, settings: Mapping[str, object]) -> ModelOptions:
+def _model(data: SceneBlockData, job: SceneJob, images: Sequence[ImageEntry], second: bool) -> ModelOptions:
+    """The trajectory model of images that share their corrections, with the sigmas that hold for them."""
+    steps = step_settings(data.trajectory_settings(images), data.then, job.model, job.then, job.given)
+    model = job.then if second and job.then is not None else job.model
     try:
-        return MODELS[model].from_settings(settings)
+        return MODELS[model].from_settings(steps[second])
     except ValueError as error:
         raise UserError(f"{data.name}: model {model}: {error}") from None
 

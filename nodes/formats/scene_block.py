@@ -161,12 +161,16 @@ class SceneBlockData:
             np.array([place[id] for id in self.ground.id], dtype=np.int64), position, covariance, self.ground.role
         )
 
-    def trajectory_settings(self) -> dict[str, object]:
-        """Sigmas of the corrections: of the project, else of the metadata (the largest of all scenes), else usual.
+    def trajectory_settings(self, images: Sequence[ImageEntry] | None = None) -> dict[str, object]:
+        """Sigmas of the corrections: of the project, else of the metadata, else usual.
 
         Times of lines that are off move the ground as an offset along the track does, and across it as the Earth turns.
+
+        Parameters
+        ----------
+        images : that share the corrections, whose largest sigmas count; None for all
         """
-        rigorous = [e for e in self.images if e.scene.model == "rigorous"]
+        rigorous = [e for e in (self.images if images is None else images) if e.scene.model == "rigorous"]
         found: dict[str, object] = {}
         if rigorous:
             stated = [e.scene.scene.sigmas for e in rigorous]
@@ -194,9 +198,9 @@ class SceneBlockData:
 
 
 def _largest(stated: Sequence[ArrayLike], usual: object) -> Array:
-    """The largest of each component; of one that a scene does not state (0), the usual one."""
+    """The largest of each component; for one that a scene does not state (0) the usual one stands."""
     values = np.asarray(stated, dtype=float)
-    return np.where((values > 0).all(axis=0), values.max(axis=0), np.asarray(usual, dtype=float))
+    return np.where(values > 0, values, np.asarray(usual, dtype=float)).max(axis=0)
 
 
 def _offset_rate(location: PushbroomSensor | Rpc) -> Array:

@@ -215,11 +215,11 @@ def _ground(data: SceneBlockData, frame: LocalFrame) -> KnownPoints:
 
 def _sigmas(data: SceneBlockData, images: list[_Image], frame: LocalFrame) -> dict[str, object]:
     """Sigmas of the corrections: those of scenes are along the track and about the body, these of X .. kappa."""
-    settings = data.trajectory_settings()
     stated: dict[str, object] = {key: value for key, value in data.trajectory.items() if key not in _CARRIED}
-    offset, shift, drift = (np.asarray(settings[key], dtype=float) for key in _CARRIED)
     found: list[Array] = []
     for image in images:
+        settings = data.trajectory_settings([image.entry])
+        offset, shift, drift = (np.asarray(settings[key], dtype=float) for key in _CARRIED)
         ends = np.sort(image.sensor.line_times.time_of(np.array([0.0, image.sensor.lines - 1.0])))
         middle = float(ends.mean())
         pose = image.sensor.motion.at([middle])

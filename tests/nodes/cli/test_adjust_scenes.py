@@ -176,6 +176,32 @@ def test_times_that_metadata_state_to_be_uncertain_count_as_an_offset_along_the_
     assert 1.2 < ratio < 1.5  # of two equal and opposite errors: the root of 2
 
 
+def test_scenes_have_the_sigmas_of_their_own_metadata(made, tmp_path, capsys):
+    """All had the largest of any scene; where one stated none, all had the usual ones, however large those stated."""
+    block = tmp_path / "two"
+    block.mkdir()
+    points = pd.read_csv(made / "image_points.csv").assign(strip=lambda t: t["ccd"].map({"F": "fore", "B": "aft"}))
+    points.drop(columns="ccd").to_csv(block / "image_points.csv", index=False)
+    for scene, ccd in (("fore", "F"), ("aft", "B")):
+        shutil.copytree(made / "spot5-hrs", block / scene)
+        times = pd.read_csv(block / scene / "line_times.csv")
+        times[times["ccd"] == ccd].to_csv(block / scene / "line_times.csv", index=False)
+    with open(block / "aft" / "scene.toml", "a") as file:
+        file.write("\n[sigma]\nposition_m = [30, 40, 50]\nattitude_deg = [0.05, 0.05, 0.05]\n")
+    project = "".join(f"[scenes.{scene}]\nmetadata = {scene!r}\n" for scene in ("fore", "aft"))
+    (block / "project.toml").write_text(project)
+    assert main(["adjust", str(block), "--json", "--snoop"]) == 0
+    strips = json.loads(capsys.readouterr().out)["strips"]
+    sigma = {scene: strips[scene]["offset_m_sigma"] for scene in strips}
+    assert max(sigma["fore"]) < 10.0 < 15.0 < min(sigma["aft"]), sigma
+    data = read_scene_block(block)
+    fore, aft = (data.trajectory_settings([image]) for image in data.images)
+    assert fore["offset_sigma_m"] == [5.0, 5.0, 5.0] and fore["shift_sigma_deg"] == [0.01, 0.01, 0.01]
+    assert aft["offset_sigma_m"] == [30.0, 40.0, 50.0]
+    np.testing.assert_allclose(aft["shift_sigma_deg"], 0.05)
+    np.testing.assert_allclose(data.trajectory_settings()["offset_sigma_m"], [30.0, 40.0, 50.0])
+
+
 def test_iterations_are_of_every_adjustment_and_the_result_counts_them_all(block, capsys):
     """Data snooping took up to 20 steps in each round, whatever was asked for, and the result had those of the last."""
 
