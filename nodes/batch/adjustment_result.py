@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -457,9 +458,14 @@ def _deserted_control(result: BatchResult) -> list[str]:
     known[network.control.point] = np.isfinite(network.control.sigma_m).any(axis=1)
     used = np.bincount(network.rays.point, result.solution.ray_weight > 0, network.n_points) > 0
     lost = np.flatnonzero(known & ~used & (network.rays_per_point > 0))
-    if not len(lost):
+    return deserted_note([str(network.point_ids[p]) for p in lost])
+
+
+def deserted_note(points: Sequence[str]) -> list[str]:
+    """What is said of control by these names that lost all its image points; nothing where there is none."""
+    if not points:
         return []
-    names = ", ".join(str(network.point_ids[p]) for p in lost[:5]) + (" ..." if len(lost) > 5 else "")
+    names = ", ".join(points[:5]) + (" ..." if len(points) > 5 else "")
     return [f"control that lost all its image points and stands as given: {names}; wrong coordinates, or a wrong name?"]
 
 

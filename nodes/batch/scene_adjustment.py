@@ -36,7 +36,7 @@ from ..errors import UserError
 from ..formats.satellite.rpc_files import write_rpb
 from ..formats.scene_block import ImageEntry, SceneBlockData
 from ..formats.table import write_table
-from .adjustment_result import reliability_summary
+from .adjustment_result import deserted_note, reliability_summary
 from .json_values import plain
 from .two_steps import sigmas_stated, step_settings
 
@@ -467,6 +467,8 @@ def _notes(a: SceneAdjustment) -> list[str]:
     if a.snooping is not None and a.snooping.given_up:
         share = 100 * a.snooping.given_up
         notes.append(f"data snooping given up: {share:.0f} % of the image points would go; model or sigmas are wrong")
+    measured, kept = (np.isin(np.arange(len(data.point_ids)), data.rays.point[m]) for m in (slice(None), s.ray_weight))
+    notes += deserted_note([data.point_ids[p] for p in np.flatnonzero(s.given.any(axis=1) & measured & ~kept)])
     if not a.problem.given.any():
         notes.append("no control: position and attitude of the block come from the a-priori sigmas of its orbits")
     if a.before is not None and not a.before[1].converged:

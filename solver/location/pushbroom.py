@@ -134,14 +134,19 @@ class PushbroomSensor:
             direction = without_aberration(direction, self.motion.inertial_velocity(pose.position_e, pose.velocity_e))
         return Rays(pose.position_e, direction)
 
-    def pose(self, line: ArrayLike) -> FixedPoses:
+    def pose(self, line: ArrayLike, *, held: bool = False) -> FixedPoses:
         """Earth-fixed pose of the perspective centre at lines (n,).
+
+        Parameters
+        ----------
+        held : beyond orbit and attitude as at their ends
 
         Raises
         ------
-        ValueError : a line whose time orbit or attitude do not cover
+        ValueError : a line whose time orbit or attitude do not cover, unless it is held
         """
-        return self._pose(self.line_times.time_of(np.atleast_1d(np.asarray(line, dtype=float))))
+        u = np.atleast_1d(np.asarray(line, dtype=float))
+        return self._pose(self._time_inside(u) if held else self.line_times.time_of(u))
 
     @property
     def covered_lines(self) -> tuple[float, float]:

@@ -208,7 +208,7 @@ class RigorousRays:
         near = np.asarray(np.isfinite(first).all(axis=1))
         place = np.where(near[:, None], first, self._pixel)
         place[:, 0] = np.clip(place[:, 0], ends[0], ends[1])
-        lines = _Lines(image, place[:, 0], place[:, 1])
+        lines = _Lines(image, place[:, 0], place[:, 1], held=True)  # the time of an end may be rounded beyond it
         computed, geometry = lines.computed(position_e, values)
         return lines.equations(self._pixel - computed, geometry, position_e)
 
@@ -234,13 +234,13 @@ class _Step:
 class _Lines:
     """Pixels of an image with the poses at their lines."""
 
-    def __init__(self, image: RigorousImage, u: Array, v: Array):
+    def __init__(self, image: RigorousImage, u: Array, v: Array, held: bool = False):
         self._image, sensor = image, image.sensor
         self._pixel = np.stack([u, v], axis=1)
-        self._pose = sensor.pose(u)
+        self._pose = sensor.pose(u, held=held)
         high = sensor.covered_lines[1]
         self._step = np.where(u + _STEP_LINES <= high, _STEP_LINES, -_STEP_LINES)
-        self._next = sensor.pose(u + self._step)
+        self._next = sensor.pose(u + self._step, held=held)
         times = sensor.line_times.time_of(u), sensor.line_times.time_of(u + self._step)
         self._numbers, self._functions = image.corrections.model.design(times[0]).functions()
         self._next_functions = image.corrections.model.design(times[1]).functions()

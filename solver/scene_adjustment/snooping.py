@@ -2,7 +2,9 @@
 
 Of an object point at most one image point goes in a round, and none that fails by much less than the worst of all. What
 was left out and agrees with the rest returns once. A control coordinate goes only where it fails clearly while the
-image points fit. Where too many image points would go, model or sigmas are wrong, and nothing is left out.
+image points fit; where all image points of a point went, three or more, and agree with each other, its given
+coordinates go in their place: grossly wrong ones bend the block so much that these fail first. Where too many image
+points would go, model or sigmas are wrong, and nothing is left out.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..adjustment.point_consensus import ORIENTATION_SHARE
 from ..adjustment.reliability import CRITICAL_W
 from ..adjustment.snooping import (
     CONTROL_CLEAR,
@@ -20,9 +23,10 @@ from ..adjustment.snooping import (
     MOST_ROUNDS,
     TOGETHER,
     failing_w,
+    joint_limit,
     largest_of_group,
 )
-from .solution import MOST_ITERATIONS, SceneSolution, adjust
+from .solution import MOST_ITERATIONS, SceneSolution, State, adjust, intersect, linearise
 
 Array = NDArray[np.floating]
 
@@ -68,9 +72,10 @@ def snoop(
     if not critical > 0:
         raise ValueError(f"critical value {critical}, wanted more than 0")
     beginning, point = solution, solution.problem.block.rays.point
-    use, given = np.ones(len(point), dtype=bool), solution.given.copy()
+    use, given = np.ones(len(point), dtype=bool), solution.problem.given.copy()
     returned = np.zeros(len(point), dtype=bool)
     returned_given: set[tuple[int, int]] = set()
+    exchanged: set[int] = set()
     rounds, w_then, taken = 0, np.zeros(len(point)), solution.iterations
     for rounds in range(1, MOST_ROUNDS + 1):
         before = use.copy(), given.copy()
@@ -80,18 +85,22 @@ def snoop(
         if (use == before[0]).all() and (given == before[1]).all():
             _bring_back(solution, critical, use, given, returned, returned_given)
         if (use == before[0]).all() and (given == before[1]).all():
+            solution = _exchange(solution, critical, use, given, exchanged)
+        if (use == before[0]).all() and (given == before[1]).all():
             break
         share = float((~use).sum()) / len(use)
         if share > MOST_LEFT_OUT:
             beginning = replace(beginning, iterations=taken)
             return SceneSnooping(beginning, np.empty(0, dtype=np.int64), np.empty(0), (), rounds, share)
-        solution = adjust(solution.problem, solution.state, use, given, max_iterations)
+        # gross errors bend a block so that it does not converge, and some points are lost: it begins anew without them
+        state = solution.state if solution.converged else None
+        solution = adjust(solution.problem, state, use, given, max_iterations)
         taken += solution.iterations
     out = np.flatnonzero(~use)
     w = _larger(solution.test)
     w = np.where(w != 0.0, w, w_then)
     out = out[np.argsort(-np.abs(w[out]), kind="stable")]
-    p, axis = np.nonzero(beginning.given & ~given)
+    p, axis = np.nonzero(solution.problem.given & ~given)
     solution = replace(solution, iterations=taken)
     return SceneSnooping(solution, out, w[out], tuple(zip(p.tolist(), axis.tolist(), strict=True)), rounds)
 
@@ -154,3 +163,36 @@ def _bring_back(
         if miss**2 <= critical**2 * variance:
             given[p, axis] = True
             returned_given.add((int(p), int(axis)))
+
+
+def _exchange(
+    solution: SceneSolution, critical: float, use: NDArray[np.bool_], given: NDArray[np.bool_], exchanged: set[int]
+) -> SceneSolution:
+    """Put back into the masks all image points of a point that went, in place of its given coordinates.
+
+    Each point once, and only where its image points, three or more, agree with each other.
+
+    Returns
+    -------
+    SceneSolution ; the same, with these points where their rays meet, from where the adjustment goes on
+    """
+    problem, point = solution.problem, solution.problem.block.rays.point
+    n = len(given)
+    rays, kept = np.bincount(point, minlength=n), np.bincount(point, use, n)
+    deserted = given.any(axis=1) & (rays >= 3) & (kept == 0)
+    deserted[list(exchanged)] = False
+    points = np.flatnonzero(deserted)
+    if not len(points):
+        return solution
+    exchanged.update(points.tolist())
+    mine = deserted[point]
+    met, determined = intersect(problem, solution.state, mine)
+    state = State(met, solution.state.values)
+    v = linearise(problem, state, mine, np.zeros_like(given)).misclosure
+    agrees = np.square(v).sum(axis=1) <= joint_limit(critical) * ORIENTATION_SHARE**2  # not so where it is NaN
+    position = solution.state.position_e.copy()
+    for p in points:
+        own = point == p
+        if determined[p] and agrees[own].all():
+            use[own], given[p], position[p] = True, False, met[p]
+    return replace(solution, state=State(position, solution.state.values))

@@ -319,10 +319,11 @@ class _Reduced:
 def _reduce(normals: Normals) -> _Reduced:
     p, u = len(normals.N_pp), len(normals.N_tt)
     on = normals.determined
-    inverse = np.zeros((p, 3, 3))
-    inverse[on] = np.linalg.inv(normals.N_pp[on])
-    half = np.zeros((p, 3, 3))
-    half[on] = np.linalg.cholesky(inverse[on])
+    # scaled as for the test that they are determined, so that those that pass it have a root
+    half, scale_p = np.zeros((p, 3, 3)), np.sqrt(np.einsum("pii->pi", normals.N_pp[on]))
+    roots = np.linalg.cholesky(normals.N_pp[on] / (scale_p[:, :, None] * scale_p[:, None, :]))
+    half[on] = np.swapaxes(np.linalg.inv(roots), -1, -2) / scale_p[:, :, None]
+    inverse = half @ np.swapaxes(half, -1, -2)
     W = (normals.N_tp @ half).transpose(1, 0, 2).reshape(u, -1)
     S = normals.N_tt - W @ W.T
     rhs = normals.n_t - np.einsum("puj,pjk,pk->u", normals.N_tp, inverse, normals.n_p, optimize=True)

@@ -202,6 +202,21 @@ def test_scenes_have_the_sigmas_of_their_own_metadata(made, tmp_path, capsys):
     np.testing.assert_allclose(data.trajectory_settings()["offset_sigma_m"], [30.0, 40.0, 50.0])
 
 
+def test_control_that_lost_its_image_points_is_named(block, capsys):
+    """A latitude mistyped by a degree: of two rays nothing tells who is wrong, and the point stands as it was given.
+
+    The adjustment ended with "time -5.024848 s lies outside the attitude [-5.024848, 106.975152] s".
+    """
+    known = pd.read_csv(block / "ground_points.csv")
+    wrong = known.loc[known["role"] == "control", "point"].iloc[0]
+    known.loc[known["point"] == wrong, "Y_m"] += 3.0
+    known.to_csv(block / "ground_points.csv", index=False)
+    assert main(["adjust", str(block), "--snoop", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert 0.8 < result["sigma0"] < 1.2 and result["control"]["n"] == 8
+    assert any(f"lost all its image points and stands as given: {wrong};" in note for note in result["notes"])
+
+
 def test_iterations_are_of_every_adjustment_and_the_result_counts_them_all(block, capsys):
     """Data snooping took up to 20 steps in each round, whatever was asked for, and the result had those of the last."""
 

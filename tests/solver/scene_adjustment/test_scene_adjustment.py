@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from triline.solver.camera.self_calibration import lens, prism
+from triline.solver.geometry.ellipsoid import WGS84
 from triline.solver.location.rpc_fit import fit_to_model
 from triline.solver.models.dgr import DgrOptions
 from triline.solver.scene_adjustment.block import GIVEN, KnownGround, SceneBlock
@@ -246,6 +247,35 @@ def test_gross_errors_are_found_and_named():
     np.testing.assert_allclose(
         misses(after.solution, simulation)[12:].std(), misses(clean, simulation)[12:].std(), rtol=0.25
     )
+
+
+@pytest.mark.parametrize(("sensor", "exchanged"), [("alos-prism", True), ("spot5-hrs", False)])
+def test_control_that_is_degrees_off_leaves_the_block_as_it_is_without_it(sensor, exchanged):
+    """A block that it bent did not find back: rays beyond the orbit, normal equations of points without a root, points
+    that were lost for good; and all image points of the control went, not its coordinates, where three of them agree.
+    """
+    simulation = simulated(sensor, points=60, seed=8)
+    block = simulation.block
+    for place in range(2):
+        lat, lon, height = WGS84.geodetic(block.known.position_e[place : place + 1])[0]
+        for off_deg in (-1.0, 1.0):
+            position = block.known.position_e.copy()
+            position[place] = WGS84.cartesian(lat + np.radians(off_deg), lon, height)
+            typed = replace(block, known=replace(block.known, position_e=position))
+            found = snoop(adjust(prepare(typed)))
+            point = block.known.point[place]
+            own = np.flatnonzero(block.rays.point == point)
+            kept = found.solution
+            if exchanged:
+                assert {p for p, _ in found.coordinates} == {point} and not set(own) & set(found.rays)
+                assert np.linalg.norm(misses(kept, simulation)[point]) < 20.0
+            else:
+                assert set(own) <= set(found.rays)  # nothing tells whether two rays are wrong or it
+            assert kept.determined.all() and kept.converged and 0.8 < kept.sigma0 < 1.2
+            assert len(set(found.rays) - set(own)) < 0.07 * len(block.rays)
+            other = np.flatnonzero(np.arange(len(block.point_ids)) != point)
+            sigma = kept.sigma0 * np.sqrt(np.einsum("pii->pi", kept.points_covariance[other]))
+            assert np.sqrt(np.mean(np.square(misses(kept, simulation)[other] / sigma))) < 1.6
 
 
 def test_snooping_gives_up_where_sigmas_are_wrong():
