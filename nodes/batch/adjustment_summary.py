@@ -102,7 +102,7 @@ def _strips(content: Content) -> Iterator[str]:
         if "coefficients" in strip:
             yield f"image {id}, {strip['model']}"
             for name, c in strip["coefficients"].items():
-                yield f"  {name:24s}{c['value']:16.8g} +- {_number(c['sigma'])}"
+                yield f"  {name:24s}{c['value']:16.8g} +- {_number(c['sigma'], '.3g')}"
 
 
 def _platform(c: Content) -> Iterator[str]:
@@ -186,5 +186,5 @@ def _digits(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
+def _number(value: float | None, spec: str = ".3f") -> str:
+    return "-" if value is None else f"{value:{spec}}"

@@ -373,6 +373,10 @@ def test_rpc_and_dlt_beside_rigorous(block, capsys):
     assert len(result["strips"]["forward"]["coefficients"]) == 11
     assert result["strips"]["backward"]["coefficients"]["line shift"]["sigma"] > 0
     assert not result["undetermined"] and result["converged"]
+    assert main(["adjust", str(block)]) == 0
+    printed = re.findall(r"denominator by .* \+- (\S+)", capsys.readouterr().out)
+    sigmas = [c["sigma"] for name, c in result["strips"]["forward"]["coefficients"].items() if "denominator" in name]
+    np.testing.assert_allclose([float(word) for word in printed], sigmas, rtol=0.01)  # all of them were 0.000
 
 
 def put(text, *changes):
