@@ -48,6 +48,8 @@ CAMERA, PER_LINE = "camera.json", "orientation_lines.csv"
 #: Sigmas so many times as large as stated are a fault of something else.
 UNLIKELY = 20.0
 LIKELIER = "a wrong unit, datum, time or camera is likelier"
+#: An adjustment that has not converged is refused if its sigma0 is larger than this.
+HOPELESS = 100.0
 #: Control so many metres from where its rays meet is not where it is stated, whatever the trajectory.
 ELSEWHERE_M = 500.0
 PLOTS = ("residuals.png", "points.png", "corrections.png")
@@ -491,12 +493,16 @@ def _far_control(network: Network) -> str:
         return ""
     points = network.control.point[measured]
     off = np.where(known[measured], network.control.xyz_l[measured] - network.where_rays_meet(points), 0.0)
-    away = np.linalg.norm(off, axis=1)
+    return elsewhere([str(network.point_ids[p]) for p in points], np.linalg.norm(off, axis=1), ELSEWHERE_M)
+
+
+def elsewhere(names: Sequence[str], away: Array, limit_m: float) -> str:
+    """Control by these names that lies so far, metres (n,), from where its rays meet, in words; "" within the limit."""
     usual, worst = float(np.median(away)), int(np.argmax(away))
-    if usual > ELSEWHERE_M:
+    if usual > limit_m:
         return f"control lies {usual:.0f} m from where its rays meet (median): check its coordinate reference system"
-    if away[worst] > ELSEWHERE_M:
-        return f"control point {network.point_ids[points[worst]]} lies {away[worst]:.0f} m from where its rays meet"
+    if away[worst] > limit_m:
+        return f"control point {names[worst]} lies {away[worst]:.0f} m from where its rays meet"
     return ""
 
 

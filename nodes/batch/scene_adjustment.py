@@ -31,12 +31,13 @@ from ...solver.scene_adjustment.solution import (
     intersect,
     points_enu,
     prepare,
+    where_rays_meet,
 )
 from ..errors import UserError
 from ..formats.satellite.rpc_files import write_rpb
 from ..formats.scene_block import ImageEntry, SceneBlockData
 from ..formats.table import write_table
-from .adjustment_result import deserted_note, reliability_summary
+from .adjustment_result import HOPELESS, deserted_note, elsewhere, reliability_summary
 from .json_values import plain
 from .two_steps import sigmas_stated, step_settings
 
@@ -51,6 +52,9 @@ SETS = ("lens", "scene")
 _ROWS = 101
 #: Heights of a fitted RPC reach so far beyond those of the points, metres.
 _BEYOND_M = 500.0
+#: Control so many metres from where its rays meet is not where it is stated. Derived: half a degree of attitude from
+#: 830 km up is less.
+_ELSEWHERE_M = 10_000.0
 #: Pairs of correlated unknowns that are listed.
 _MOST_LISTED = 20
 TABLES = ("points.csv", "residuals.csv", "trajectory_refined.csv")
@@ -119,7 +123,7 @@ def run_scene_job(data: SceneBlockData, job: SceneJob) -> SceneAdjustment:
 
     Raises
     ------
-    UserError : a block from which nothing can be computed, settings that no model takes
+    UserError : a block from which nothing can be computed or that does not converge, settings that no model takes
     """
     start = time.perf_counter()
     try:
@@ -137,7 +141,32 @@ def run_scene_job(data: SceneBlockData, job: SceneJob) -> SceneAdjustment:
     except ValueError as error:
         raise UserError(f"{data.name}: cannot be adjusted: {error}") from None
     seconds = time.perf_counter() - start
-    return SceneAdjustment(data, job, problem, solution, found, seconds, before)
+    adjustment = SceneAdjustment(data, job, problem, solution, found, seconds, before)
+    sigma0 = adjustment.test.sigma0
+    if not solution.converged and sigma0 > HOPELESS:
+        raise UserError(f"{data.name}: does not converge (sigma0 {sigma0:.3g}); {_where_to_look(adjustment)}")
+    return adjustment
+
+
+def _where_to_look(a: SceneAdjustment) -> str:
+    """What to check when nothing fits, in words: control that lies elsewhere, the image with the largest residuals."""
+    problem, known = a.problem, a.problem.block.known
+    size = np.linalg.norm(np.nan_to_num(a.solution.residual_px, nan=np.inf), axis=1)
+    median = [float(np.median(size[mine])) for mine in problem.block.rays_of]
+    worst = int(np.argmax(median))
+    pixels = f", {median[worst]:.0f} px" if np.isfinite(median[worst]) else ""
+    said = f"residuals are largest in image {a.data.images[worst].name}{pixels}: check its metadata and image points"
+    try:
+        with np.errstate(all="ignore"):  # what is not finite is not determined
+            position, determined = where_rays_meet((a.before or (problem,))[0])
+    except NotAdjustableError:
+        return said
+    k = np.flatnonzero(known.given.any(axis=1) & determined[known.point])
+    if not len(k):
+        return said
+    off = np.where(known.given[k], points_enu(problem, position, known.position_e[k], known.point[k]), 0.0)
+    far = elsewhere([a.data.point_ids[p] for p in known.point[k]], np.linalg.norm(off, axis=1), _ELSEWHERE_M)
+    return f"{far}; {said}" if far else said
 
 
 def _stage(

@@ -35,7 +35,7 @@ from ...solver.models.lim import FEWEST_FIXES
 from ...solver.models.platform import MOST_CLOCK_S, MOST_LEVER_ARM_M, USUAL_PLATFORM, PlatformErrors
 from ...solver.partitioned.engine import Engine
 from ...solver.partitioned.part import RAYS
-from ..batch.adjustment_result import CAMERA, PER_LINE, PLOTS, TABLES, Adjustment, result_of, where_to_look
+from ..batch.adjustment_result import CAMERA, HOPELESS, PER_LINE, PLOTS, TABLES, Adjustment, result_of, where_to_look
 from ..batch.adjustment_summary import summary_lines
 from ..batch.adjustment_tables import oriented_lines, write_tables
 from ..batch.partition_runner import DaskRunner, FolderStore, ProcessRunner
@@ -66,9 +66,6 @@ EXAMPLE = """triline adjust block/ --model dgr --selfcal tls18 --snoop -o result
   triline adjust flight.mcap --camera result/camera.json -o again
   triline adjust flight.mcap --dem ground.tif --dem-sigma 0.5 --dem-crs EPSG:5773 --per-line -o result
   triline adjust day1.mcap day2.mcap --workers 4 --snoop -o result"""
-
-#: An adjustment that has not converged is refused if its sigma0 is larger than this.
-HOPELESS = 100.0
 
 #: Renamed strips that a note lists.
 RENAMED_SHOWN = 6

@@ -243,6 +243,19 @@ def intersect(problem: Problem, state: State, use: NDArray[np.bool_]) -> tuple[A
     return position, determined
 
 
+def where_rays_meet(problem: Problem) -> tuple[Array, NDArray[np.bool_]]:
+    """Points (p, 3) where their rays meet before anything is adjusted or known of them, and which are determined.
+
+    Raises
+    ------
+    NotAdjustableError : no ray of an image that locates by itself reaches the ground
+    """
+    block = problem.block
+    start = _first_positions(block, np.full_like(problem.given_e, np.nan))
+    locating = np.array([image.locates for image in block.images])[block.rays.image]
+    return intersect(problem, State(start, np.zeros(block.layout.n_unknowns)), locating)
+
+
 def linearise(problem: Problem, state: State, use: NDArray[np.bool_], given: NDArray[np.bool_]) -> Normals:
     """Normal equations of rays, known coordinates and a-priori knowledge that take part, at a state."""
     block, u = problem.block, problem.block.layout.n_unknowns

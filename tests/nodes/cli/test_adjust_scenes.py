@@ -217,6 +217,28 @@ def test_control_that_lost_its_image_points_is_named(block, capsys):
     assert any(f"lost all its image points and stands as given: {wrong};" in note for note in result["notes"])
 
 
+@pytest.mark.parametrize(
+    ("off_deg", "all_of_it", "told"),
+    [
+        (1.0, False, r"control point {} lies 11\d{{4}} m from where its rays meet"),
+        (-90.0, True, r"control lies \d{{7}} m from where its rays meet \(median\): check its coordinate reference"),
+    ],
+)
+def test_a_block_that_does_not_converge_names_control_that_lies_elsewhere(
+    off_deg, all_of_it, told, block, tmp_path, capsys
+):
+    """It was a result: polynomials that look kilometres beside, and a note that it has not converged."""
+    known = pd.read_csv(block / "ground_points.csv")
+    control = known["role"] == "control"
+    wrong = known.loc[control, "point"].iloc[1]
+    known.loc[control if all_of_it else known["point"] == wrong, "Y_m"] += off_deg
+    known.to_csv(block / "ground_points.csv", index=False)
+    assert main(["adjust", str(block), "-o", str(tmp_path / "out")]) == 1
+    error = capsys.readouterr().err
+    assert re.search(r"does not converge \(sigma0 .*\); " + told.format(wrong), error), error
+    assert not (tmp_path / "out" / "rpc").exists()
+
+
 def test_iterations_are_of_every_adjustment_and_the_result_counts_them_all(block, capsys):
     """Data snooping took up to 20 steps in each round, whatever was asked for, and the result had those of the last."""
 
