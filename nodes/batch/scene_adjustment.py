@@ -496,10 +496,7 @@ def _notes(a: SceneAdjustment) -> list[str]:
     if a.snooping is not None and a.snooping.given_up:
         share = 100 * a.snooping.given_up
         notes.append(f"data snooping given up: {share:.0f} % of the image points would go; model or sigmas are wrong")
-    measured, kept = (np.isin(np.arange(len(data.point_ids)), data.rays.point[m]) for m in (slice(None), s.ray_weight))
-    notes += deserted_note([data.point_ids[p] for p in np.flatnonzero(s.given.any(axis=1) & measured & ~kept)])
-    if not a.problem.given.any():
-        notes.append("no control: position and attitude of the block come from the a-priori sigmas of its orbits")
+    notes += _control_notes(a)
     if a.before is not None and not a.before[1].converged:
         notes.append(f"the first of two steps has not converged after {a.before[1].iterations} iterations")
     if not s.converged:
@@ -513,6 +510,19 @@ def _notes(a: SceneAdjustment) -> list[str]:
         notes.append("corrections: X along the track, Y across it to the right, Z up; omega about forward, phi about "
                      "right, kappa about down")  # fmt: skip
     return notes
+
+
+def _control_notes(a: SceneAdjustment) -> list[str]:
+    """What is to be said of control that no image measures, or no longer does."""
+    rays, ids = a.data.rays.point, a.data.point_ids
+    given = a.problem.given.any(axis=1)
+    measured, kept = (np.isin(np.arange(len(ids)), points) for points in (rays, rays[a.solution.ray_weight]))
+    lost = deserted_note([ids[p] for p in np.flatnonzero(a.solution.given.any(axis=1) & measured & ~kept)])
+    n, never = np.count_nonzero(given), np.count_nonzero(given & ~measured)
+    if never == n:
+        what = f"no control point of {n} is measured in an image" if n else "no control"
+        return [f"{what}: position and attitude of the block come from the a-priori sigmas of its orbits"]
+    return [f"{never} of {n} control points are measured in no image", *lost] if never else lost
 
 
 # tables

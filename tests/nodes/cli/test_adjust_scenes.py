@@ -239,6 +239,20 @@ def test_a_block_that_does_not_converge_names_control_that_lies_elsewhere(
     assert not (tmp_path / "out" / "rpc").exists()
 
 
+def test_control_by_names_that_no_image_point_has_is_told(block, capsys):
+    """Of control that images name otherwise nothing was said, not even where the block stands on its orbits alone."""
+    known = pd.read_csv(block / "ground_points.csv")
+    control = np.flatnonzero(known["role"] == "control")
+    for some, told in (
+        (control[:2], "2 of 9 control points are measured in no image"),
+        (control[2:], "no control point of 9 is measured in an image: position and attitude of the block come from"),
+    ):
+        known.loc[some, "point"] = "G" + known.loc[some, "point"]
+        known.to_csv(block / "ground_points.csv", index=False)
+        assert main(["adjust", str(block), "--snoop", "--json"]) == 0
+        assert any(note.startswith(told) for note in json.loads(capsys.readouterr().out)["notes"])
+
+
 def test_iterations_are_of_every_adjustment_and_the_result_counts_them_all(block, capsys):
     """Data snooping took up to 20 steps in each round, whatever was asked for, and the result had those of the last."""
 
