@@ -444,13 +444,18 @@ def _test_notes(adjustment: Adjustment) -> list[str]:
             "heavier tails than stated, sigmas of points are too small"
         )
     w = control_tests(result.solution, result.cofactors)
+    return notes + failing_note(network.point_ids, w, critical) + _deserted_control(result)
+
+
+def failing_note(points: Sequence[str], w: Array, critical: float) -> list[str]:
+    """What is said of control whose normalised residuals (p, 3), adjusted minus given, fail; nothing where none do."""
     worst = [(p, a) for p, a in np.argwhere(np.abs(w) > critical)]
     worst.sort(key=lambda key: -abs(w[key]))
-    if worst:
-        names = ", ".join(f"{network.point_ids[p]} {'XYZ'[a]} ({w[p, a]:+.1f})" for p, a in worst[:5])
-        more = " ..." if len(worst) > 5 else ""
-        notes.append(f"{len(worst)} control coordinates have |w| > {critical:g}: {names}{more}")
-    return notes + _deserted_control(result)
+    if not worst:
+        return []
+    names = ", ".join(f"{points[p]} {'XYZ'[a]} ({w[p, a]:+.1f})" for p, a in worst[:5])
+    more = " ..." if len(worst) > 5 else ""
+    return [f"{len(worst)} control coordinates have |w| > {critical:g}: {names}{more}"]
 
 
 def _deserted_control(result: BatchResult) -> list[str]:

@@ -37,7 +37,7 @@ from ..errors import UserError
 from ..formats.satellite.rpc_files import write_rpb
 from ..formats.scene_block import ImageEntry, SceneBlockData
 from ..formats.table import write_table
-from .adjustment_result import HOPELESS, deserted_note, elsewhere, reliability_summary
+from .adjustment_result import HOPELESS, deserted_note, elsewhere, failing_note, reliability_summary
 from .json_values import plain
 from .two_steps import sigmas_stated, step_settings
 
@@ -513,16 +513,17 @@ def _notes(a: SceneAdjustment) -> list[str]:
 
 
 def _control_notes(a: SceneAdjustment) -> list[str]:
-    """What is to be said of control that no image measures, or no longer does."""
+    """What is to be said of control that does not fit, and of control that no image measures, or no longer does."""
     rays, ids = a.data.rays.point, a.data.point_ids
     given = a.problem.given.any(axis=1)
     measured, kept = (np.isin(np.arange(len(ids)), points) for points in (rays, rays[a.solution.ray_weight]))
-    lost = deserted_note([ids[p] for p in np.flatnonzero(a.solution.given.any(axis=1) & measured & ~kept)])
+    said = failing_note(ids, -a.solution.given_test, a.job.critical)  # adjusted minus given
+    said += deserted_note([ids[p] for p in np.flatnonzero(a.solution.given.any(axis=1) & measured & ~kept)])
     n, never = np.count_nonzero(given), np.count_nonzero(given & ~measured)
     if never == n:
         what = f"no control point of {n} is measured in an image" if n else "no control"
         return [f"{what}: position and attitude of the block come from the a-priori sigmas of its orbits"]
-    return [f"{never} of {n} control points are measured in no image", *lost] if never else lost
+    return [f"{never} of {n} control points are measured in no image", *said] if never else said
 
 
 # tables

@@ -253,6 +253,22 @@ def test_control_by_names_that_no_image_point_has_is_told(block, capsys):
         assert any(note.startswith(told) for note in json.loads(capsys.readouterr().out)["notes"])
 
 
+def test_control_that_does_not_fit_is_named_without_snooping_too(block, capsys):
+    """A block with control 100 m off had a sigma0 that fails, and nothing said where to look."""
+    known = pd.read_csv(block / "ground_points.csv")
+    wrong = np.flatnonzero(known["role"] == "control")[3]
+    known.loc[wrong, "Y_m"] += 0.001
+    known.to_csv(block / "ground_points.csv", index=False)
+    notes = {}
+    for snoop in ((), ("--snoop",)):
+        assert main(["adjust", str(block), "--json", *snoop]) == 0
+        notes[snoop] = [note for note in json.loads(capsys.readouterr().out)["notes"] if "control coord" in note]
+    (said,) = notes[()]
+    worst = re.match(r"\d+ control coordinates have \|w\| > 3.29: (\w+) Y \(-", said)
+    assert worst and worst[1] == known["point"][wrong], said  # adjusted minus given, which is too far north
+    assert not notes["--snoop",]  # it is left out
+
+
 def test_iterations_are_of_every_adjustment_and_the_result_counts_them_all(block, capsys):
     """Data snooping took up to 20 steps in each round, whatever was asked for, and the result had those of the last."""
 
