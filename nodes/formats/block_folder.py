@@ -155,10 +155,7 @@ def _project(folder: Path, notes: list[str]) -> tuple[str, str, Apriori]:
     settings, then = trajectory_settings(trajectory)
     for table in (file, project, apriori):
         notes.extend(f"project.toml: key {key} is not known and was ignored" for key in table.unread())
-    known = setting_names()
-    for table, stated in (("trajectory", settings), ("trajectory.then", then)):
-        unknown = [key for key in stated if key not in known]
-        notes.extend(f"project.toml: {table}: key {key} is not known and was ignored" for key in unknown)
+    notes.extend(unknown_settings(settings, then))
     return name, crs, Apriori(sigma, settings, then)
 
 
@@ -173,6 +170,17 @@ def trajectory_settings(table: Keys) -> tuple[dict[str, object], dict[str, objec
     if "then" in then.values:
         raise then.refuse("then", "no third step")
     return _settings(table), _settings(then)
+
+
+def unknown_settings(settings: Mapping[str, object], then: Mapping[str, object]) -> list[str]:
+    """A note for each key of ``[trajectory]`` and ``[trajectory.then]`` that no model knows."""
+    known, tables = setting_names(), (("trajectory", settings), ("trajectory.then", then))
+    return [
+        f"project.toml: {table}: key {key} is not known and was ignored"
+        for table, stated in tables
+        for key in stated
+        if key not in known
+    ]
 
 
 def _settings(table: Keys) -> dict[str, object]:

@@ -33,7 +33,7 @@ from ...solver.scene_adjustment.functional import (
 from ...solver.scene_adjustment.images import ImageModel
 from ...solver.scene_adjustment.rigorous import LensView, lens_view
 from ..errors import UserError
-from .block_folder import GROUND, known_points, trajectory_settings
+from .block_folder import GROUND, known_points, trajectory_settings, unknown_settings
 from .keys import Keys, read_toml
 from .projection import notes_of_heights
 from .satellite.read import read_scene
@@ -235,10 +235,12 @@ def read_scene_block(folder: Path) -> SceneBlockData:
     name, crs = project.text("name", folder.resolve().name), project.text("crs", "EPSG:4979")
     sigma = apriori.number("image_sigma_px", 0.3, positive=True)
     settings, then = trajectory_settings(trajectory)
-    rpc = _rpc_settings(file.table("rpc"))
+    of_rpc = file.table("rpc")
+    rpc = _rpc_settings(of_rpc)
     scenes = _scenes(folder, file.table("scenes"), notes)
-    for table in (file, project, apriori):
+    for table in (file, project, apriori, of_rpc):
         notes.extend(f"project.toml: key {key} is not known and was ignored" for key in table.unread())
+    notes.extend(unknown_settings(settings, then))
     images = _images(scenes)
     ellipsoid = _ellipsoid(folder, images)
     ground, frame = _ground(folder, crs, ellipsoid, notes)

@@ -617,6 +617,18 @@ def test_rows_that_cannot_be_used_are_named_and_the_rest_adjusted(block, capsys)
     assert "points are not determined by their rays and were left out" in notes
 
 
+def test_keys_of_sigmas_that_are_not_known_are_told(block, capsys):
+    """``ofset_sigma_m`` was left out without a word, and the usual sigmas held."""
+    with open(block / "project.toml", "a") as file:
+        file.write("[rpc]\nshift_sigma = 3\n[trajectory]\nofset_sigma_m = [1, 1, 1]\nshift_sigma_deg = 0.01\n")
+    assert main(["adjust", str(block), "--json"]) == 0
+    told = [note for note in json.loads(capsys.readouterr().out)["notes"] if "is not known" in note]
+    assert told == [
+        "project.toml: key rpc.shift_sigma is not known and was ignored",
+        "project.toml: trajectory: key ofset_sigma_m is not known and was ignored",
+    ]
+
+
 def test_image_points_of_a_line_that_its_scene_has_not(block, capsys):
     """Of a scene with the line F alone those of F and those without a name count; those of B were taken for F's."""
     times = block / "spot5-hrs" / "line_times.csv"
