@@ -634,7 +634,10 @@ def _write_rpcs(a: SceneAdjustment, folder: Path) -> list[str]:
     of_name: dict[str, str] = {}  # file -> image
     for k, (entry, image) in enumerate(zip(a.data.images, a.problem.block.images, strict=True)):
         if entry.size_px is None:
-            notes.append(f"image {entry.name}: no RPC written: its metadata do not say how large it is")
+            notes.append(
+                f"image {entry.name}: no RPC written: its metadata do not say how large it is; name the image itself "
+                "as metadata, with the polynomials in it or beside it"
+            )
             continue
         located: Any = image.located(a.values_of(k))
         try:
