@@ -367,17 +367,17 @@ def _image_points(
     line, sample = table["line"], table["sample"]
     usable = image_of >= 0
     for k, image in enumerate(images):
-        if image.size_px is None:
-            continue
         mine = image_of == k
-        low, high = -_OUTSIDE_PX, np.array(image.size_px) - 1.0 + _OUTSIDE_PX
+        # where the image begins is known, be its size known or not
+        size = image.size_px or (np.inf, np.inf)
+        low, high = -_OUTSIDE_PX, np.array(size) - 1.0 + _OUTSIDE_PX
         outside = mine & ~((line >= low) & (line <= high[0]) & (sample >= low) & (sample <= high[1]))
         usable &= ~outside
+        of_size = f" of {size[0]} lines and {size[1]} samples" if image.size_px else ""
         for row in np.flatnonzero(outside):
-            size = f"{image.size_px[0]} lines and {image.size_px[1]} samples"
             unusable.append(
                 f"image_points.csv:{table.line_of(int(row))}: line: {line[row]:g}, sample {sample[row]:g} lies outside "
-                f"image {image.name} of {size}; the ray cannot be used"
+                f"image {image.name}{of_size}; the ray cannot be used"
             )
     notes.extend(unusable[:_MOST_NAMED])
     if len(unusable) > _MOST_NAMED:

@@ -635,6 +635,17 @@ def test_rows_that_cannot_be_used_are_named_and_the_rest_adjusted(block, capsys)
     assert "points are not determined by their rays and were left out" in notes
 
 
+def test_image_points_before_the_first_row_of_polynomials_of_no_size_are_told(block, capsys):
+    write_rpb(block / "F.RPB", fit_to_model(read_scene(block / "spot5-hrs").sensors["F"], -500.0, 2500.0).rpc)
+    image_points = block / "image_points.csv"
+    image_points.write_text(image_points.read_text().replace(",scene,F,", ",forward,,") + "P1,forward,,-70,100,0.3\n")
+    with open(block / "project.toml", "a") as file:
+        file.write('[scenes.forward]\nmetadata = "F.RPB"\n')
+    assert main(["adjust", str(block), "--snoop", "--json"]) == 0
+    notes = "\n".join(json.loads(capsys.readouterr().out)["notes"])
+    assert "line: -70, sample 100 lies outside image forward; the ray cannot be used" in notes
+
+
 def test_keys_of_sigmas_that_are_not_known_are_told(block, capsys):
     """``ofset_sigma_m`` was left out without a word, and the usual sigmas held."""
     with open(block / "project.toml", "a") as file:
