@@ -41,6 +41,8 @@ UNKNOWN_CLIMB_M_S = 20.0
 #: No sentence is longer (82 by the standard; some receivers write more), bytes.
 LONGEST = 512
 KNOT_M_S = 1852.0 / 3600.0
+#: A minute of latitude, m.
+MINUTE_M = 1852.0
 
 
 @dataclass(frozen=True)
@@ -100,19 +102,21 @@ class NmeaParser:
         self._stated: tuple[int, tuple[float, float, float]] | None = None  # sigmas, of a GST
         self._quality = self._stated_quality = 0  # of the newest GGA, and of the one a GST is about
         self._motion: tuple[int, tuple[float, float]] | None = None  # east and north velocity, of an RMC
+        self._few_told = False  # that fixes are rounded
 
     def feed(self, data: bytes) -> list[Message]:
         """The messages that follow from more bytes."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > LONGEST:
             self._problem("not NMEA", f"{len(self._rest)} bytes without an end of line: {_shown(self._rest)}")
-            self._rest = b""
+            begun = self._rest[-LONGEST:].rpartition(b"$")[1:]  # a sentence that follows what was no NMEA
+            self._rest = b"".join(begun) if begun[0] else b""
         return [message for line in lines for message in self._line(line.strip())]
 
     def _line(self, line: bytes) -> list[Message]:
         if not line:
             return []
-        start = line.find(b"$")
+        start = line.rfind(b"$")  # binary messages of the receiver may stand before it, with any bytes
         if start < 0 or len(line) - start > LONGEST:
             self._problem("not NMEA", _shown(line))
             return []
@@ -179,13 +183,13 @@ class NmeaParser:
             self._problem("time does not go on", f"GGA of {s.time} does not come after the one before")
             return []
         self._last_ns = self._epoch_ns = utc_ns
-        sigma = self._sigma(utc_ns, quality, s.HDOP)
+        place = _number(s.lat), _number(s.lon), _number(s.alt) + _number(s.sep)
+        check_place(*place)
+        sigma = self._as_written(self._sigma(utc_ns, quality, s.HDOP), s)
         velocity: tuple[Any, ...] = ()
         if self._settings.velocity_sigma_m_s and self._motion is not None and self._motion[0] == utc_ns:
             level = self._settings.velocity_sigma_m_s
             velocity = (*self._motion[1], 0.0), (level, level, UNKNOWN_CLIMB_M_S)
-        place = _number(s.lat), _number(s.lon), _number(s.alt) + _number(s.sep)
-        check_place(*place)
         body = gnss_message(utc_ns, place, sigma, *velocity)
         return [Message("sensor/gnss", self._settings.clock.stamp(utc_ns), body)]
 
@@ -225,6 +229,30 @@ class NmeaParser:
                 return sigma
         level = QUALITY_SIGMA_M[quality] * max(_number(hdop or 1.0), 0.5)
         return level, level, 2.0 * level
+
+    def _as_written(self, sigma: tuple[float, float, float], s: Any) -> tuple[float, float, float]:
+        """Accuracy of a fix (east, north, up, m) with its rounding; that this is the larger part is told once."""
+        rounding = _rounding_m(s)
+        lost, own = max(zip(rounding, sigma, strict=True), key=lambda both: both[0] / both[1])
+        if lost > own and not self._few_told:
+            self._few_told = True
+            what = f"GGA are rounded, which makes {lost:.3f} m (1 sigma) of a fix known to {own:.3f} m"
+            self._problem("few figures", f"{what}: let the receiver write more of them")
+        east, north, up = (math.hypot(*both) for both in zip(sigma, rounding, strict=True))
+        return east, north, up
+
+
+def _rounding_m(s: Any) -> tuple[float, float, float]:
+    """East, north, up, m: sigma of what a GGA lost where its figures end, a uniform error of half a unit at most."""
+    _, latitude, _, longitude, *_ = s.payload
+    north, east = (_last_figure(field) * MINUTE_M / math.sqrt(12.0) for field in (latitude, longitude))
+    up = math.hypot(_last_figure(s.payload[8]), _last_figure(s.payload[10])) / math.sqrt(12.0)
+    return east * math.cos(math.radians(_number(s.lat))), north, up
+
+
+def _last_figure(field: str) -> float:
+    """What one unit of the last figure of a number counts."""
+    return 10.0 ** -len(field.partition(".")[2])
 
 
 def _number(field: Any) -> float:
