@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -276,7 +277,8 @@ class LineFiles(Sensor):
         super().__init__(settings.id)
         self._settings = settings
         self._period_ns = round(SECOND_NS / settings.rate_hz)
-        self._strips: dict[str, tuple[int, int, int]] = {}  # first line time, lines, last stamp; of those not ended
+        self._strips: dict[str, _Part] = {}  # of those not ended, by the name that the files give them
+        self._times_begun: Counter[str] = Counter()
         self._newest_s = 0.0
 
     def messages(self, stop: Event) -> Iterator[Message | None]:
@@ -366,24 +368,61 @@ class LineFiles(Sensor):
     ) -> Iterator[Message]:
         """The block, after the announcement of a strip that begins with it."""
         clock, rate_hz = self._settings.clock, self._settings.rate_hz
-        time_ns = clock.utc(time_ns)
-        times = None if known is None else np.array(known, dtype=np.int64) - clock.offset_ns
-        message = block_message(
-            clock, LineBlock(pixels, ccd, strip, first, time_ns, 0 if known is not None else self._period_ns, times)
-        )
         if strip not in self._strips:
             yield from self._end_strips()
-            first_ns = time_ns - round(first * SECOND_NS / rate_hz)
-            self._strips[strip] = first_ns, 0, message.stamp_ns
-            yield strip_message(strip, first_ns, rate_hz, message.stamp_ns)
-        first_ns, lines, newest_ns = self._strips[strip]
-        self._strips[strip] = first_ns, max(lines, first + len(pixels)), max(newest_ns, message.stamp_ns)
+        part = self._strips.get(strip) or self._begun(strip, first)
+        missing = part.base - first  # of a CCD line that was behind the others when the strip ended
+        if missing > 0:
+            self.problem("lines before their strip", f"{min(missing, len(pixels))} of {ccd} from line {first} on")
+            pixels, known = pixels[missing:], None if known is None else known[missing:]
+            time_ns = time_ns + missing * self._period_ns if not known else known[0]
+        if not len(pixels):
+            return
+        line, time_ns = max(-missing, 0), clock.utc(time_ns)
+        times = None if known is None else np.array(known, dtype=np.int64) - clock.offset_ns
+        message = block_message(
+            clock, LineBlock(pixels, ccd, part.name, line, time_ns, 0 if known is not None else self._period_ns, times)
+        )
+        if part.newest_ns is None:
+            part.first_ns, part.newest_ns = time_ns - round(line * SECOND_NS / rate_hz), message.stamp_ns
+            yield strip_message(part.name, part.first_ns, rate_hz, message.stamp_ns)
+        part.lines, part.newest_ns = max(part.lines, line + len(pixels)), max(part.newest_ns, message.stamp_ns)
         yield message
 
+    def _begun(self, strip: str, first: int) -> _Part:
+        """A strip begins; one that goes on after its end gets a name of its own, and counts from the line given."""
+        self._times_begun[strip] += 1
+        again = self._times_begun[strip]
+        part = self._strips[strip] = _Part(strip) if again == 1 else _Part(f"{strip}-{again}", first)
+        if again > 1:
+            self.problem("strip goes on", f"{strip} had ended; from its line {first} on it is strip {part.name}")
+        return part
+
     def _end_strips(self) -> Iterator[Message]:
-        for id, (first_ns, lines, newest_ns) in self._strips.items():
-            yield strip_message(id, first_ns, self._settings.rate_hz, newest_ns, lines)
+        for part in self._strips.values():
+            if part.newest_ns is not None:
+                yield strip_message(part.name, part.first_ns, self._settings.rate_hz, part.newest_ns, part.lines)
         self._strips.clear()
+
+
+@dataclass
+class _Part:
+    """A strip that has not ended.
+
+    Attributes
+    ----------
+    name : its id on the bus
+    base : what the files count for its line 0
+    lines : so many have come
+    first_ns : UTC of line 0
+    newest_ns : last stamp; None before the first block
+    """
+
+    name: str
+    base: int = 0
+    lines: int = 0
+    first_ns: int = 0
+    newest_ns: int | None = None
 
 
 class Silence:

@@ -104,6 +104,35 @@ def test_a_second_band_of_a_raw_file_is_refused(tmp_path):
         read(sensor, 1)
 
 
+def test_a_strip_that_goes_on_after_its_end_gets_another_name(tmp_path, monkeypatch):
+    """Under the same name it was announced twice, and nodes that had ended it refused all that came then."""
+    monkeypatch.setattr("triline.nodes.sensors.line_camera.SILENT_S", 0.3)
+    for ccd, band, n in (("F", 0, 20), ("N", 1, 18)):  # the one is two lines behind
+        (tmp_path / f"{ccd}.raw").write_bytes(IMAGE[:n, band].tobytes())
+    sensor = LineFiles(settings(tmp_path, images={"F": "F.raw", "N": "N.raw"}, first_time=START))
+    messages, stop = [], threading.Event()
+    for message in sensor.messages(stop):
+        messages += [] if message is None else [message]
+        if len(messages) and messages[-1].topic == "configuration/strip" and messages[-1].body.ended:
+            for ccd, band in (("F", 0), ("N", 1)):
+                (tmp_path / f"{ccd}.raw").write_bytes(IMAGE[:, band].tobytes())
+        if sum(len(m.body.pixels) for m in messages if m.topic.startswith("sensor")) == 78:
+            stop.set()
+    strips = [m.body for m in messages if m.topic == "configuration/strip"]
+    assert [(s.id, s.ended, s.lines) for s in strips] == [
+        ("S7", False, 0), ("S7", True, 20), ("S7-2", False, 0), ("S7-2", True, 20)
+    ]  # fmt: skip
+    assert strips[2].first_line_time_ns == T + 20 * 10_000_000
+    later = [m.body for m in messages if m.topic.startswith("sensor") and m.body.strip == "S7-2"]
+    for ccd, band in (("F", 0), ("N", 1)):
+        of = [b for b in later if b.ccd == ccd]
+        np.testing.assert_array_equal(np.concatenate([b.pixels for b in of]), IMAGE[20:, band])
+        assert of[0].first_line == 0
+        times = np.concatenate([b.times_ns() for b in of])
+        np.testing.assert_array_equal(times, T + np.arange(20, 40) * 10_000_000)
+    assert dict(sensor.counters) == {"strip goes on": 1, "lines before their strip": 1}
+
+
 def test_a_folder_of_blocks(tmp_path):
     folder = tmp_path / "blocks"
     folder.mkdir()
