@@ -34,6 +34,7 @@ class FoundStrips:
         self._newest_ns: dict[str, int] = {}
         self._end_ns: dict[str, int] = {}  # when the last line was imaged, of lines with times of their own
         self._off: set[str] = set()
+        self._silent: set[str] = set()  # strips that have ended because no lines came
 
     def __contains__(self, id: str) -> bool:
         return id in self._begun
@@ -57,7 +58,8 @@ class FoundStrips:
         return strip
 
     def note(self, block: LineBlock, stamp_ns: int, announced: Any = None) -> str:
-        """Keep how far a strip is; returns a line for the operator where lines are off its rate, once a strip.
+        """Keep how far a strip is; returns a line for the operator where lines come after its end, or are off its rate,
+        once a strip.
 
         Lines with times of their own may be: tie points get these (`LineTimes`).
 
@@ -82,6 +84,12 @@ class FoundStrips:
         if own:
             self._end_ns[strip.id] = max(self._end_ns.get(strip.id, 0), int(block.times_ns()[-1]))
         self._newest_ns[strip.id] = max(self._newest_ns.get(strip.id, 0), stamp_ns)
+        if strip.id in self._silent:
+            self._silent.remove(strip.id)
+            return (
+                f"{strip.id}: lines come again from line {block.first_line} on, after the strip has ended for want of "
+                "them: no tie points of them are used, no orientation is refined; they want the name of another strip"
+            )
         return self._told_off(strip, off, block)
 
     def _told_off(self, strip: Any, off: float, block: LineBlock) -> str:
@@ -100,6 +108,7 @@ class FoundStrips:
     def ended(self, stamp_ns: int, block: LineBlock | None = None) -> list[Any]:
         """Strips that have ended: another one has lines now, or there have been none for a while."""
         silent = [id for id, newest_ns in self._newest_ns.items() if stamp_ns - newest_ns > SILENT_NS]
+        self._silent.update(silent)
         others = [] if block is None else [id for id in self._newest_ns if id != block.strip]
         return [self._end(id) for id in dict.fromkeys((*silent, *others))]
 

@@ -117,6 +117,19 @@ def test_a_strip_that_begins_anew_under_its_name_is_refused():
     assert node.counters["malformed"] >= 1 and "wants another name" in node.last_problem
 
 
+def test_a_strip_that_goes_on_after_its_end_is_told():
+    """Its numbers go with its times, so that it is not refused; what refines the orientation has ended the strip."""
+    found = FoundStrips()
+    found.begin(block("S1", 0))
+    assert found.note(block("S1", 0), EPOCH_NS) == ""
+    assert not found.ended(EPOCH_NS + 4 * 10**9)
+    assert [strip.id for strip in found.ended(EPOCH_NS + 6 * 10**9)] == ["S1"]
+    again = block("S1", round(8 * 10**9 / PERIOD_NS))
+    told = found.note(again, EPOCH_NS + 8 * 10**9)
+    assert told.startswith(f"S1: lines come again from line {again.first_line} on, after the strip has ended")
+    assert found.note(block("S1", again.first_line + 20), EPOCH_NS + 8 * 10**9 + 10**8) == ""  # once
+
+
 def test_what_follows_from_the_matcher_does_not_move_the_end_of_a_strip():
     """The adjuster's last words come before or after the matcher's, as it happens when a flight is ended."""
     ends = []
