@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from datetime import date, datetime
 from typing import Any
 
+from .. import registry
 from ..errors import UserError
 from ..formats.flight_folder import FILE, Flight
 from ..formats.keys import Keys
@@ -73,6 +74,8 @@ def _program(flight: Flight, keys: Keys) -> SensorProgram:
     id = keys.text("id", kind)
     if not id.replace("-", "").replace("_", "").isalnum():
         raise keys.refuse("id", "a word of letters, digits, _ and -")
+    if id in registry.names() and id not in registry.SENSORS:
+        raise keys.refuse("id", "another name, for a node of triline has this one")
     settings = KINDS[kind].read(keys, flight.folder)
     check = getattr(settings, "check_camera", None)
     if check is not None and flight.camera is not None:

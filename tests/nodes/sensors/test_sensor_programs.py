@@ -114,6 +114,7 @@ WRONG = {
     "no kind": ('kind = "nmea"\n', "", "sensor[0].kind: missing, wanted a text"),
     "key": ("clock_offset_s", "clock_ofset_s", "sensor[1].clock_ofset_s: not known, wanted id, kind"),
     "id": ('id = "camera"', 'id = "my camera"', "sensor[1].id: 'my camera', wanted a word of letters"),
+    "id of a node": ('id = "camera"', 'id = "navigator"', "sensor[1].id: 'navigator', wanted another name, for a node"),
     "twice": ('id = "camera"', 'id = "nmea"', "sensor[1].id: 'nmea', wanted another name for each sensor"),
     "CCD line": ("{N =", "{Q =", "sensor[2].images: CCD line 'Q', wanted F, N, B"),
     "band": ('"file:gnss.nmea"', '"gnss.nmea"', "sensor[0].address: 'gnss.nmea', wanted serial:PORT"),
