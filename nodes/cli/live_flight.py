@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -61,6 +61,7 @@ class LiveFlight:
         self.restarts = 0
         self.watch: SensorWatch | None = None
         self._lost: dict[str, int] = {}
+        self._failed: dict[str, str] = {}  # by node, of which part of the work failed
         self._again: dict[str, float] = {}  # sensor programs that have ended, and when they are started again
         self._ended: Counter[str] = Counter()  # how often they have
         self.viewer_mode = self._viewer_mode()
@@ -248,6 +249,7 @@ class LiveFlight:
                 group.processes[name].stop(30.0, self.folder if name == "recorder" else None)
                 time.sleep(0.7)  # its last messages still have to reach the other nodes
                 show()
+        self._failed = failed_nodes(overview.nodes)
 
     @contextmanager
     def _monitor(self, port: int) -> Iterator[tuple[Bus, Any, Callable[[], set[str]]]]:
@@ -292,7 +294,7 @@ class LiveFlight:
                 result = {"no_report": str(error)}
         result.update(
             recordings=[str(path) for path in recordings], restarts=self.restarts,
-            landed_early=self.stop.is_set(), viewer=self.viewer_mode, lost=self._lost,
+            landed_early=self.stop.is_set(), viewer=self.viewer_mode, lost=self._lost, failed=self._failed,
         )  # fmt: skip
         return result
 
@@ -325,6 +327,7 @@ class LiveFlight:
         lines += self.remarks(result)
         if result["lost"]:
             lines.append("lost or late: " + ", ".join(f"{what} {n}" for what, n in result["lost"].items()))
+        lines += [f"{name}: {text} (see {self.folder / 'log'})" for name, text in result.get("failed", {}).items()]
         if self.restarts:
             lines.append(f"{self.restarts} nodes were started again")
         if others := [path for path in result["recordings"] if path != str(self.recording)]:
@@ -355,6 +358,18 @@ def add_view_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--headless", action="store_true", help="no window; the scene goes to a .rrd file instead")
     parser.add_argument("--web", action="store_true", help="show the scene in a browser (loopback only)")
     parser.add_argument("--secure", type=Path, metavar="BUNDLE", help="of the aircraft, by `triline keys`: encrypted")
+
+
+def failed_nodes(statuses: Mapping[str, Any]) -> dict[str, str]:
+    """By node, how often its work failed, by the newest status of each: what it would have given is missing."""
+    failed = {}
+    for name, status in statuses.items():
+        times = sum(counter.value for counter in status.counters if counter.name == "failed")
+        if times:
+            failed[name] = (
+                f"failed {times} times, its results are not complete; its last problem: {status.last_problem}"
+            )
+    return failed
 
 
 @contextmanager

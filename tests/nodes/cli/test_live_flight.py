@@ -8,7 +8,8 @@ from pathlib import Path
 
 from triline.nodes.cli import main
 from triline.nodes.cli.demo import Demo
-from triline.nodes.cli.live_flight import LiveFlight
+from triline.nodes.cli.live_flight import LiveFlight, failed_nodes
+from triline.schemas import messages as m
 
 RESULT = {"lost": {}, "waited_s": 0.0}
 
@@ -44,6 +45,19 @@ def test_a_flight_whose_report_cannot_be_made_says_what_was_recorded(tmp_path):
     said = flight.summary({**result, "waited_s": 0.0})
     assert f"no report: {result['no_report']}\n" in said and f"recording  {tmp_path}/flight.mcap\n" in said
     assert "report     " not in said
+
+
+def test_a_node_whose_work_failed_is_named_at_the_end(tmp_path):
+    """An adjuster that failed at the end of a flight wrote no last orientations, and its log alone said so."""
+    status = m.NodeStatus(node="adjuster", last_problem="the end: ValueError: by design (results.py:61)")
+    status.counters.add(name="wander restated", value=19)
+    statuses = {"adjuster": status, "matcher": m.NodeStatus(node="matcher")}
+    assert failed_nodes(statuses | {"adjuster": m.NodeStatus()}) == {}
+    status.counters.add(name="failed", value=1)
+    failed = failed_nodes(statuses)
+    assert list(failed) == ["adjuster"]
+    said = demo(tmp_path).summary({**RESULT, "recordings": [], "failed": failed})
+    assert "adjuster: failed 1 times, its results are not complete; its last problem: the end: ValueError: by" in said
 
 
 def test_a_file_is_neither_a_flight_nor_a_folder_of_results(tmp_path, capsys):
