@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from heapq import merge
 from typing import Any
 
@@ -94,34 +94,26 @@ def lines_of(strip: Strip) -> int:
 
 
 def strip_shifts(block: BlockData) -> NDArray[np.float64]:
-    """Seconds (strips,) to add to the times of each strip so that no two trajectories overlap."""
-    names = _file_names(block.strips)
-    spans: dict[str, tuple[float, float]] = {}
-    for name, strip in zip(names, block.strips, strict=True):
+    """Seconds (strips,) to add to the times of each strip so that no two trajectories overlap.
+
+    Lenses that share a trajectory come one after the other, too, as an on-line adjustment takes them.
+    """
+    spans = []
+    for strip in block.strips:
         ends = [strip.trajectory.start_s, strip.trajectory.end_s]
         if strip.lines:
             ends.extend(strip.time_of(np.array([0.0, strip.lines - 1.0])).tolist())
-        low, high = spans.get(name, (np.inf, -np.inf))
-        spans[name] = min(low, *ends), max(high, *ends)
-    shift: dict[str, float] = {}
-    after = max(0.0, -np.floor(min(low for low, _ in spans.values()))) if spans else 0.0
+        spans.append((min(ends), max(ends)))
+    shift = np.zeros(len(spans))
+    after = max(0.0, -np.floor(min(low for low, _ in spans))) if spans else 0.0
     end = -np.inf
-    for name in sorted(spans, key=lambda n: spans[n][0]):
-        low, high = spans[name]
+    for i in sorted(range(len(spans)), key=lambda i: spans[i][0]):
+        low, high = spans[i]
         if low + after <= end:
             after += np.ceil(end + GAP_S - low - after)
-        shift[name] = after
+        shift[i] = after
         end = high + after
-    return np.array([shift[name] for name in names])
-
-
-def _file_names(strips: Sequence[Strip]) -> list[str]:
-    """What each strip is shifted with: lenses that share a trajectory keep their times to each other."""
-    names = [strip.id if strip.lens is None else strip.id.removesuffix(f"/{strip.lens}") for strip in strips]
-    trajectories: dict[str, set[int]] = {}
-    for name, strip in zip(names, strips, strict=True):
-        trajectories.setdefault(name, set()).add(id(strip.trajectory))
-    return [name if len(trajectories[name]) == 1 else strip.id for name, strip in zip(names, strips, strict=True)]
+    return shift
 
 
 class _Times:

@@ -223,6 +223,18 @@ def test_overlapping_strips_are_set_apart_by_whole_seconds():
     assert block.strips[1].trajectory.start_s + shift[1] >= end
 
 
+def test_strips_of_lenses_that_share_a_trajectory_are_set_apart():
+    """At the same times an on-line adjustment lost half of the looks, and took every pose for one that came twice."""
+    block = simulated_block()
+    first = block.strips[0]
+    lenses = tuple(replace(first, id=f"S1/{lens}", lens=lens) for lens in ("L1", "L2"))
+    block = replace(block, strips=lenses)
+    shift = strip_shifts(block)
+    assert shift[0] == 0 and first.trajectory.start_s + shift[1] > first.trajectory.end_s
+    stamps = [m.stamp_ns for m in block_messages(block) if m.topic == "trajectory/smoothed"]
+    assert len(stamps) == len(set(stamps)) == 2 * len(first.trajectory.time_s)
+
+
 def test_block_survives_the_recording(tmp_path):
     block = simulated_block("EPSG:32632")
     sigma = 0.2 + 0.01 * np.arange(len(block.image))
