@@ -14,14 +14,19 @@ from ...schemas.groups import grouped
 from ...schemas.topics import rank
 from ...solver.adjustment.block_data import BlockData
 from ...solver.adjustment.network import Strip
-from ...solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion
+from ...solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion, quaternion_from_matrix
+from ...solver.geometry.trajectory import Trajectory
 from ...solver.models import WANDER_TIMES
 from ...solver.models.dgr import DgrOptions
-from ..convert import SECOND_NS, camera_message, ground_point_message, pose_message
+from ..convert import SECOND_NS, camera_message, ground_point_message, largest_step_ns, pose_message
 from ..node import Message
 
 #: Time between strips whose times overlap in the files, after they are shifted, s.
 GAP_S = 10.0
+#: Poses farther apart, s, have a gap between them on line, in which there is no orientation.
+APART_S = 0.2
+#: Poses that are put in between are so far apart, s; over longer steps than a minute there are none.
+FILLED_S, LONGEST_FILLED_S = 0.1, 60.0
 #: Strips that a note names.
 MOST_NAMED = 3
 #: A-priori sigmas of the trajectory that a project message carries.
@@ -32,8 +37,9 @@ def block_messages(block: BlockData, source: str = "import") -> Iterator[Message
     """All messages of a block, sorted by stamp and rank.
 
     Time in the files counts from the Unix epoch. Strips whose times overlap are shifted by whole seconds, so that one
-    follows the other. Configuration and control come first. A pose has the time it is valid for. The image points of an
-    object point come strip by strip, at the time when the last of them in the strip was imaged.
+    follows the other. Configuration and control come first. A pose has the time it is valid for; where they are too far
+    apart for an on-line adjustment, there are others in between (`filled`). The image points of an object point come
+    strip by strip, at the time when the last of them in the strip was imaged.
     """
     times = _Times(block)
     start = min((begin for begin, _ in times.extents), default=0)
@@ -72,6 +78,13 @@ def not_carried(block: BlockData) -> list[str]:
         if not strip.lines:
             notes.append(
                 f"strip {strip.id}: number of lines not known, taken as the {lines_of(strip)} under its trajectory"
+            )
+    for strip in block.strips:
+        more = len(filled(strip.trajectory)) - len(strip.trajectory)
+        if more > len(strip.trajectory):
+            usual = float(np.median(np.diff(strip.trajectory.time_s)))
+            notes.append(
+                f"strip {strip.id}: poses are {usual:.3g} s apart: {more} interpolated ones are put in between"
             )
     shift = strip_shifts(block)
     moved = shift - min(shift, default=0.0)
@@ -210,7 +223,7 @@ def _pass_messages(block: BlockData, times: _Times, i: int, source: str) -> Iter
 
 def _pose_messages(block: BlockData, times: _Times, i: int, source: str) -> Iterator[Message]:
     strip = block.strips[i]
-    trajectory = strip.trajectory
+    trajectory = filled(strip.trajectory)
     angles = angles_from_matrix(matrix_from_quaternion(trajectory.quaternion))
     velocity = trajectory.at(trajectory.time_s).velocity_l
     covariance = _pose_covariance(block)
@@ -225,6 +238,22 @@ def _pose_messages(block: BlockData, times: _Times, i: int, source: str) -> Iter
             velocity_l=velocity[k],
         )
         yield Message("trajectory/smoothed", stamp, body, source)
+
+
+def filled(trajectory: Trajectory) -> Trajectory:
+    """A trajectory whose samples come less often than five times a second with others in between, as a batch adjustment
+    interpolates them; none in gaps."""
+    time_s = trajectory.time_s
+    step = np.diff(time_s)
+    longest = min(largest_step_ns(np.rint(time_s * SECOND_NS).astype(np.int64)) / SECOND_NS, LONGEST_FILLED_S)
+    thin = (step > APART_S) & (step <= longest)
+    if not thin.any():
+        return trajectory
+    number = np.where(thin, np.ceil(step / FILLED_S - 1e-6), 1.0).astype(np.int64)
+    place = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number)
+    times = np.append(np.repeat(time_s[:-1], number) + place * np.repeat(step / number, number), time_s[-1])
+    poses = trajectory.at(times)
+    return Trajectory(times, poses.position_l, quaternion_from_matrix(poses.R_lc))
 
 
 def _tie_messages(block: BlockData, times: _Times, source: str) -> Iterator[Message]:

@@ -17,7 +17,7 @@ from triline.nodes.cli.import_ import GO_WITH
 from triline.nodes.convert import pose_sample
 from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
-from triline.nodes.formats.block_messages import block_messages, not_carried, strip_shifts
+from triline.nodes.formats.block_messages import block_messages, filled, not_carried, strip_shifts
 from triline.nodes.formats.block_recording import block_from_messages
 from triline.nodes.formats.block_writer import write_block
 from triline.nodes.formats.detect import KINDS, Options, read_any
@@ -29,6 +29,7 @@ from triline.nodes.formats.track import Mounting
 from triline.nodes.recording.reader import RecordingReader
 from triline.schemas.topics import rank
 from triline.solver.geometry.earth import R_en, geodetic_from_ecef
+from triline.solver.geometry.trajectory import Trajectory
 
 TIES = DATA / "avirisng" / "tpcol_3_1.xml"
 
@@ -233,6 +234,39 @@ def test_strips_of_lenses_that_share_a_trajectory_are_set_apart():
     assert shift[0] == 0 and first.trajectory.start_s + shift[1] > first.trajectory.end_s
     stamps = [m.stamp_ns for m in block_messages(block) if m.topic == "trajectory/smoothed"]
     assert len(stamps) == len(set(stamps)) == 2 * len(first.trajectory.time_s)
+
+
+def test_poses_that_are_too_far_apart_for_the_adjuster_get_others_in_between():
+    """With poses once a second it had no orientation, so no image point was used and no point came out."""
+    block = simulated_block()
+    strip = block.strips[0]
+    whole = strip.trajectory
+    every = np.flatnonzero(np.abs(whole.time_s - np.round(whole.time_s)) < 1e-6)
+    few = Trajectory(whole.time_s[every], whole.position_l[every], whole.quaternion[every])
+    thin = replace(block, strips=(replace(strip, trajectory=few), *block.strips[1:]))
+    more = filled(few)
+    assert np.diff(more.time_s).max() <= 0.2 and set(few.time_s) <= set(more.time_s)
+    between = 0.5 * (few.time_s[1:] + few.time_s[:-1])
+    np.testing.assert_allclose(more.at(between).position_l, few.at(between).position_l, atol=1e-3)
+    np.testing.assert_allclose(more.at(between).angles, few.at(between).angles, atol=1e-6)
+    messages = list(block_messages(thin))
+    poses = [m.body.strip for m in messages if m.topic == "trajectory/smoothed"]
+    assert poses.count(strip.id) == len(more)
+    added = len(more) - len(few)
+    note = f"strip {strip.id}: poses are 1 s apart: {added} interpolated ones are put in between"
+    assert not_carried(thin)[0] == note
+    assert filled(whole) is whole
+    gap = np.concatenate([few.time_s[:5], few.time_s[5:] + 30.0])  # longer than five usual steps
+    holed = filled(Trajectory(gap, few.position_l, few.quaternion))
+    assert np.diff(holed.time_s).max() > 30.0
+
+
+def test_poses_of_a_file_that_are_too_far_apart_are_told(tmp_path):
+    rows = "".join(f"{t},47,11,1500,0,0,90\n" for t in range(100, 105))
+    path = tmp_path / "slow.csv"
+    path.write_text("time_s,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg\n" + rows)
+    note = "slow.csv: poses are 1 s apart: more than 0.2 s between two are a gap without orientation for 'process'"
+    assert note in read_any(path).notes
 
 
 def test_block_survives_the_recording(tmp_path):
