@@ -354,6 +354,7 @@ def notes_of(adjustment: Adjustment) -> list[str]:
         notes.append("factors of sigmas of the trajectory are of what the first model left of its errors, not of all")
     notes += _test_notes(adjustment)
     notes += _control_notes(result)
+    notes += _check_notes(adjustment)
     notes += _weakness_notes(result)
     if result.doubtful:
         notes.append(_doubt_note(result))
@@ -538,6 +539,15 @@ def _spread_notes(network: Network, control: Control) -> list[str]:
                 "its trajectories"]  # fmt: skip
     notes = [f"{never} of {n} control points are measured in no image"] if never else []
     return notes + _notes_on_spread(network, control.xyz_l[measured])
+
+
+def _check_notes(adjustment: Adjustment) -> list[str]:
+    """Check points that no image point measures: they are missing in the accuracies."""
+    network, ground = adjustment.result.network, adjustment.block.ground
+    check = [id for id, role in zip(ground.id, ground.role, strict=True) if role == "check"]
+    measured = {network.point_ids[p] for p in np.flatnonzero(network.rays_per_point > 0)}
+    never = sum(id not in measured for id in check)
+    return [f"{never} of {len(check)} check points are measured in no image"] if never else []
 
 
 def _notes_on_spread(network: Network, xyz: Array) -> list[str]:

@@ -326,6 +326,7 @@ class _Stage:
         start = points
         if job.robust is not None:  # a weight function that falls to zero needs a start that is not drawn away
             start = solve(problem, points, self.given, replace(job.options, robust=Huber()), tell)
+            self.steps += start.iterations
         self._keep(solve(problem, start, self.given, replace(job.options, robust=job.robust), tell))
         self._read_surface()
         if not before and not self._cut_short:  # far from the solution residuals tell nothing of noise

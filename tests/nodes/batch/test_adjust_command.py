@@ -531,6 +531,19 @@ def test_control_that_nobody_measured_and_keys_that_nobody_knows_are_told(folder
     assert code == 0 and f"note: no control point of {len(control)} is measured in an image" in out
 
 
+def test_check_points_that_nobody_measured_are_told(folder, tmp_path, capsys):
+    """They are missing in the accuracies, and nothing else said so."""
+    block = tmp_path / "block"
+    shutil.copytree(folder, block)
+    path = block / "image_points.csv"
+    check = sorted(pd.read_csv(block / "ground_points.csv").query("role == 'check'")["point"])
+    assert "check points are measured in no image" not in adjust(block, "-q", capsys=capsys)[1]
+    image = pd.read_csv(path)
+    image[~image["point"].isin(check[:2])].to_csv(path, index=False)
+    code, out, _ = adjust(block, "-q", capsys=capsys)
+    assert code == 0 and f"note: 2 of {len(check)} check points are measured in no image" in out
+
+
 def test_control_that_lost_all_its_image_points_is_named(folder, tmp_path, capsys):
     """Nothing contradicts its coordinates any more, and without --snoop nobody tests them instead."""
     block = tmp_path / "block"

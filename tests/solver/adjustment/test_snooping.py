@@ -363,6 +363,13 @@ def test_robust_estimation_leaves_good_rays_alone(weights):
     assert pickle.loads(pickle.dumps(weights)) == weights  # partitions are adjusted by other processes
 
 
+def test_steps_to_a_robust_start_count():
+    """The result said `0 iterations, converged`."""
+    network = block(7).network
+    plain, robust = run(network, Job(MODEL)), run(network, Job(MODEL, robust=Huber()))
+    assert robust.iterations >= plain.iterations > 0
+
+
 def test_igg3_names_what_it_left_without_weight():
     network, bad = with_outliers(block(7).network, 0.05, 1)
     result = run(network, Job(MODEL, robust=Igg3()))
