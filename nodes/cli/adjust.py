@@ -207,8 +207,9 @@ def run(args: argparse.Namespace) -> int:
     joined = join_inputs(recordings, paths) if len(paths) > 1 else None
     block = recordings[0] if joined is None else joined.block
     if args.camera is not None:
-        note = f"camera of {args.camera}"
-        block = replace(block, camera=read_camera_instead(args.camera, block.camera), notes=(*block.notes, note))
+        of_camera = [f"camera of {args.camera}"]
+        camera = read_camera_instead(args.camera, block.camera, notes=of_camera)
+        block = replace(block, camera=camera, notes=(*block.notes, *of_camera))
     surface = None
     if dem:
         raster, crs = Path(dem["dem"]), dem.get("dem_crs")

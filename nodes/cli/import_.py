@@ -144,18 +144,20 @@ def run(args: argparse.Namespace) -> int:
         ties = read_tie_points(source)
         result = {"rows": write_tie_points(output, ties), "statistics": statistics(ties), "notes": []}
     else:
+        of_camera: list[str] = []
         options = Options(
             args.date,
             args.crs,
             Mounting(args.lever_arm or Mounting.lever_arm_m, args.boresight or Mounting.boresight_deg),
             args.line_rate or LINE_RATE_HZ,
-            None if args.camera is None else read_camera_of(args.camera),
+            None if args.camera is None else read_camera_of(args.camera, of_camera),
             args.seconds_of_day,
             _accuracy(args),
             _lines(args, kind),
             _ground(args),
         )
         imported = read_any(source, kind, options)
+        imported.notes.extend(of_camera)
         result = _write(source, imported, output, "demo", shown=not args.quiet and not args.json)
     flight = {} if args.flight is None else {"flight": str(args.flight)}
     result = {"input": str(source), "kind": kind, **flight, "output": str(output), **result}
@@ -269,8 +271,12 @@ def _accuracy(args: argparse.Namespace) -> Accuracy:
     return Accuracy((x, y, z), (omega, phi, kappa), position is not None, attitude is not None)
 
 
-def read_camera_of(text: str) -> LineCamera:
+def read_camera_of(text: str, notes: list[str]) -> LineCamera:
     """A camera from a file (camera.json or AVIRIS-NG XML) or by the name of a preset.
+
+    Parameters
+    ----------
+    notes : gets remarks
 
     Raises
     ------
@@ -278,7 +284,7 @@ def read_camera_of(text: str) -> LineCamera:
     """
     path = Path(text)
     if path.is_file():
-        return read_glas_camera(path) if path.suffix.lower() == ".xml" else read_camera(path)
+        return read_glas_camera(path) if path.suffix.lower() == ".xml" else read_camera(path, notes)
     if text in PRESETS:
         return preset(text)
     raise UserError(f"--camera {text}: no such file, and no preset of that name; presets: {', '.join(PRESETS)}")

@@ -56,7 +56,7 @@ def read_camera(path: Path, notes: list[str] | None = None) -> LineCamera:
     return LineCamera(name, tuple(lenses.values()), tuple(lines.values()))
 
 
-def read_camera_instead(path: Path, camera: LineCamera, told: str = "") -> LineCamera:
+def read_camera_instead(path: Path, camera: LineCamera, told: str = "", notes: list[str] | None = None) -> LineCamera:
     """The camera of a ``camera.json`` that stands for another one: a calibrated one in place of that of a recording.
 
     Its CCD lines come in the order of the other's.
@@ -65,6 +65,7 @@ def read_camera_instead(path: Path, camera: LineCamera, told: str = "") -> LineC
     ----------
     camera : for which it stands
     told : of the file in the error, where it was not named by the user
+    notes : gets remarks
 
     Raises
     ------
@@ -72,7 +73,7 @@ def read_camera_instead(path: Path, camera: LineCamera, told: str = "") -> LineC
     """
     if not path.is_file():
         raise UserError(f"{path}: no such file, wanted a camera.json")
-    found = read_camera(path)
+    found = read_camera(path, notes)
 
     def lines_of(c: LineCamera) -> dict[str, tuple[int, str]]:
         lenses = len(camera.lenses) > 1 or len(c.lenses) > 1

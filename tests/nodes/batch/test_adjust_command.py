@@ -531,6 +531,16 @@ def test_control_that_nobody_measured_and_keys_that_nobody_knows_are_told(folder
     assert code == 0 and f"note: no control point of {len(control)} is measured in an image" in out
 
 
+def test_keys_of_another_camera_that_nobody_knows_are_told(folder, tmp_path, capsys):
+    """A misspelt distortion was none, without a word."""
+    camera = json.loads((folder / "camera.json").read_text())
+    camera["lenses"][0]["distorsion"] = {"k1": 1e-6}
+    path = tmp_path / "other.json"
+    path.write_text(json.dumps(camera))
+    code, out, _ = adjust(folder, "-q", "--camera", str(path), capsys=capsys)
+    assert code == 0 and "note: other.json: key lenses[0].distorsion is not known and was ignored" in out
+
+
 def test_check_points_that_nobody_measured_are_told(folder, tmp_path, capsys):
     """They are missing in the accuracies, and nothing else said so."""
     block = tmp_path / "block"

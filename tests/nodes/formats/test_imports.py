@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from places import DATA, needs_data
-from small_block import simulated_block, write_files
+from small_block import FILES, simulated_block, write_files
 from tracks import ns, straight_track
 
 from triline.nodes.cli import main
@@ -259,6 +260,18 @@ def test_poses_that_are_too_far_apart_for_the_adjuster_get_others_in_between():
     gap = np.concatenate([few.time_s[:5], few.time_s[5:] + 30.0])  # longer than five usual steps
     holed = filled(Trajectory(gap, few.position_l, few.quaternion))
     assert np.diff(holed.time_s).max() > 30.0
+
+
+def test_keys_of_a_camera_that_nobody_knows_are_told(tmp_path, capsys):
+    """A misspelt distortion was none, without a word."""
+    poses, camera = tmp_path / "poses.csv", json.loads(FILES["camera.json"])
+    rows = "".join(f"{100 + 0.1 * k},47,11,1500,0,0,90\n" for k in range(5))
+    poses.write_text("time_s,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg\n" + rows)
+    camera["lenses"][0]["distorsion"] = {"k1": 1e-6}
+    (tmp_path / "mine.json").write_text(json.dumps(camera))
+    out = str(tmp_path / "poses.mcap")
+    assert main(["import", str(poses), "-o", out, "--camera", str(tmp_path / "mine.json")]) == 0
+    assert "note: mine.json: key lenses[0].distorsion is not known and was ignored" in capsys.readouterr().out
 
 
 def test_poses_of_a_file_that_are_too_far_apart_are_told(tmp_path):
