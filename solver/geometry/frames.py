@@ -273,7 +273,10 @@ def known_crs(crs: str, *, geocentric: bool = True):
 
 def _refuse_left_handed(known, crs: str) -> None:
     """Raise CrsError where an image has no omega, phi, kappa in the axes of a CRS."""
-    axes = tuple(axis.direction.lower() for axis in known.axis_info[:2])
+    axes, height = tuple(axis.direction.lower() for axis in known.axis_info[:2]), known.axis_info[2:]
+    if height and height[0].direction.lower() == "down":
+        what = "its heights count downwards, and angles in a left-handed system are none"
+        raise CrsError(f"crs {crs!r}: {what}, wanted the one of the same map with heights upwards")
     if axes in _LEFT_HANDED:
         what = f"its axes go {' and '.join(axes)}, and angles in a left-handed system are none"
         raise CrsError(f"crs {crs!r}: {what}, wanted the one of the same map with axes to the east and north")

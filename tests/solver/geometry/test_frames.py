@@ -98,6 +98,12 @@ def test_left_handed_axes_have_no_angles(crs):
         LocalFrame.around(np.array([[1_058_147.0, 703_011.0, 300.0]]), crs)
 
 
+def test_heights_that_count_downwards_have_no_angles():
+    """A block with depths ended as a fault of triline, a rotation with a determinant of -1."""
+    with pytest.raises(CrsError, match="its heights count downwards, and angles in a left-handed system are none"):
+        LocalFrame.around([[500_000.0, 5_300_000.0, -500.0]], "EPSG:32632+EPSG:5715")
+
+
 @pytest.mark.parametrize(
     "crs, place", [("EPSG:5514", (50.0, 15.0)), ("EPSG:2053", (-26.0, 29.2)), ("EPSG:2193", (-40, 175))]
 )
