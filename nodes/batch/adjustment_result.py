@@ -336,6 +336,7 @@ def notes_of(adjustment: Adjustment) -> list[str]:
     network = result.network
     notes = [*adjustment.block.notes, *_axes_notes(adjustment.block.frame)]
     notes += dict.fromkeys(note for item in solution.layout.sets for note in item.model.notes)
+    notes += _strip_notes(result)
     if not solution.converged:
         notes.append("not converged: the figures are those of the last step")
     if result.sigma0 != result.test.sigma0 or solution.redundancy <= 0:
@@ -539,6 +540,16 @@ def _spread_notes(network: Network, control: Control) -> list[str]:
                 "its trajectories"]  # fmt: skip
     notes = [f"{never} of {n} control points are measured in no image"] if never else []
     return notes + _notes_on_spread(network, control.xyz_l[measured])
+
+
+def _strip_notes(result: BatchResult) -> list[str]:
+    """Strips without corrections, which are missing in the tables of orientation."""
+    corrected = {item.strip for item in result.solution.layout.sets}
+    lone = [strip.id for i, strip in enumerate(result.network.strips) if i not in corrected]
+    if not lone:
+        return []
+    names = ", ".join(lone[:MOST_NAMED]) + (f" and {len(lone) - MOST_NAMED} more" if len(lone) > MOST_NAMED else "")
+    return [f"strips without image points take no part, and their orientation is in no table: {names}"]
 
 
 def _check_notes(adjustment: Adjustment) -> list[str]:

@@ -541,6 +541,21 @@ def test_keys_of_another_camera_that_nobody_knows_are_told(folder, tmp_path, cap
     assert code == 0 and "note: other.json: key lenses[0].distorsion is not known and was ignored" in out
 
 
+def test_a_strip_without_image_points_is_told(folder, tmp_path, capsys):
+    """Its orientation was in no table, without a word."""
+    block = tmp_path / "block"
+    shutil.copytree(folder, block)
+    for name, time in (("strips", "first_line_time_s"), ("trajectory", "time_s")):
+        path = block / f"{name}.csv"
+        table = pd.read_csv(path)
+        more = table[table["strip"] == table["strip"].iloc[0]].assign(strip="S9")
+        pd.concat([table, more.assign(**{time: more[time] + 9000.0})]).to_csv(path, index=False)
+    code, out, _ = adjust(block, "-q", "-o", str(tmp_path / "out"), capsys=capsys)
+    assert code == 0 and "take no part, and their orientation is in no table: S9" in out
+    assert "S9" not in set(pd.read_csv(tmp_path / "out" / "trajectory_refined.csv")["strip"])
+    assert "take no part" not in adjust(folder, "-q", capsys=capsys)[1]
+
+
 def test_check_points_that_nobody_measured_are_told(folder, tmp_path, capsys):
     """They are missing in the accuracies, and nothing else said so."""
     block = tmp_path / "block"
