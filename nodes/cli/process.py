@@ -87,7 +87,8 @@ def run(args: argparse.Namespace) -> int:
     dem = dem_settings(args)
     if dem:
         tables = tables | {"adjuster": tables.get("adjuster", {}) | dem}
-    instead = {} if args.camera is None else {CAMERA: _camera(reader, args.camera)}
+    of_camera: list[str] = []
+    instead = {} if args.camera is None else {CAMERA: _camera(reader, args.camera, of_camera)}
     nodes: list[Node] = [build(registry.node_class(name), tables) for name in names]
     begun = time.monotonic()
     part = args.output.with_name(args.output.name + ".part")
@@ -118,9 +119,10 @@ def run(args: argparse.Namespace) -> int:
         part.unlink(missing_ok=True)
     seconds = time.monotonic() - begun
     if args.json:
-        print(json.dumps(result(summary, reader, args.output, seconds) | {"pace": pace}, indent=2))
+        more = {"pace": pace, "notes": [*summary.notes, *of_camera]}
+        print(json.dumps(result(summary, reader, args.output, seconds) | more, indent=2))
         return 0
-    for line in _lines(summary, reader, args.output, seconds):
+    for line in (*_lines(summary, reader, args.output, seconds), *(f"  note: {note}" for note in of_camera)):
         print(line)
     if pace != args.pace and pace == "throughput" and ADJUSTER in summary.nodes:
         print("  live orientation is that of updates 10 s apart; that of a flight comes with --pace load")
@@ -168,12 +170,12 @@ def _check(reader: RecordingReader, args: argparse.Namespace) -> None:
         raise UserError(f"{args.recording}: damaged: {what}")
 
 
-def _camera(reader: RecordingReader, path: Path) -> bytes:
-    """The message of a camera in place of that of the recording."""
+def _camera(reader: RecordingReader, path: Path, notes: list[str]) -> bytes:
+    """The message of a camera in place of that of the recording; ``notes`` gets remarks."""
     body = reader.last(CAMERA)
     if body is None:
         raise UserError(f"{reader.path}: no {CAMERA} in it, so --camera has nothing to stand for")
-    return codec.encode(camera_message(read_camera_instead(path, camera_from(body))))
+    return codec.encode(camera_message(read_camera_instead(path, camera_from(body), notes=notes)))
 
 
 def _held(reader: RecordingReader) -> str:

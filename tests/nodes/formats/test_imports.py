@@ -274,6 +274,16 @@ def test_keys_of_a_camera_that_nobody_knows_are_told(tmp_path, capsys):
     assert "note: mine.json: key lenses[0].distorsion is not known and was ignored" in capsys.readouterr().out
 
 
+def test_keys_of_another_camera_that_nobody_knows_are_told_by_process(tmp_path, capsys):
+    camera = json.loads(FILES["camera.json"])
+    camera["lenses"][0]["distorsion"] = {"k1": 1e-6}
+    (tmp_path / "mine.json").write_text(json.dumps(camera))
+    flight, out = str(tmp_path / "flight.mcap"), str(tmp_path / "out.mcap")
+    assert main(["import", str(write_files(tmp_path / "block")), "-o", flight, "-q"]) == 0
+    assert main(["process", flight, "-o", out, "--camera", str(tmp_path / "mine.json")]) == 0
+    assert "note: mine.json: key lenses[0].distorsion is not known and was ignored" in capsys.readouterr().out
+
+
 def test_poses_of_a_file_that_are_too_far_apart_are_told(tmp_path):
     rows = "".join(f"{t},47,11,1500,0,0,90\n" for t in range(100, 105))
     path = tmp_path / "slow.csv"
