@@ -358,17 +358,18 @@ class WindowStrip:
     def leaving(self, limit_s: float, state: WindowState) -> tuple[IntArray, float]:
         """Unknowns that no time after the limit needs, and the time up to which the orientation becomes final.
 
-        Unknowns in use to the end of the strip leave when it has ended and is settled (limit infinite).
+        Unknowns in use to the end of the strip leave when it has ended and is settled (limit infinite). Those that were
+        in use, and no longer are since a wander was stated anew, leave with any limit; no orientation is final by that.
         """
         if self._over:
             return self.numbers, self.final_to_s
-        present = state.places(self.numbers) >= 0
+        present, settled = state.places(self.numbers) >= 0, limit_s == np.inf
         gone = present & (self._last_use <= limit_s)
-        if not np.isinf(limit_s):
+        if not settled:
             gone &= self._last_use < self.model.extent.end_s - 1e-6
         if not gone.any():
             return np.empty(0, dtype=np.int64), self.final_to_s
-        to_s = self.end_s if np.isinf(limit_s) else float(self._last_use[gone].max())
+        to_s = self.end_s if settled else max(self.final_to_s, float(self._last_use[gone].max()))
         return self.numbers[gone], to_s
 
     def release(self) -> None:

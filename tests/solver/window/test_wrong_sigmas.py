@@ -184,6 +184,21 @@ def strip_in(state: WindowState, factor=None) -> WindowStrip:
     return strip
 
 
+@pytest.mark.parametrize("limit_s", [-np.inf, -5.0, 3.0])
+def test_borders_that_a_new_wander_no_longer_uses_make_nothing_final(limit_s):
+    """Before the first look nothing may leave (limit -inf): the strip was taken for over, or its begin for lost."""
+    learning = replace(SLOW, wander=(4e-3, 4e-3, 2e-2), attitude_time_s=6.0)
+    state = WindowState()
+    strip = WindowStrip("S1", 0.0, 100.0, 0, learning, OPTIONS, state)
+    strip.activate(9.0, state)
+    strip.restate(2.0, replace(learning, wander=(4e-2, 4e-2, 2e-1)))
+    strip.activate(11.0, state)
+    strip.restate(3.0, learning)
+    numbers, final_to_s = strip.leaving(limit_s, state)
+    assert len(numbers) and not strip.ended  # there are such borders
+    assert 0.0 <= final_to_s <= max(limit_s, 0.0)
+
+
 def seen(strip: WindowStrip, state: WindowState) -> None:
     """Observations of the corrections at some times."""
     rng = np.random.default_rng(3)
