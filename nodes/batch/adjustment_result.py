@@ -15,8 +15,15 @@ from ...solver.adjustment.job import BatchResult, Job
 from ...solver.adjustment.layout import CorrectionSet
 from ...solver.adjustment.network import Control, Network
 from ...solver.adjustment.reliability import HEAVY_TAILS, NARROWLY, Reliability, reliability
+from ...solver.adjustment.single_looks import SingleLooks, single_looks
 from ...solver.adjustment.snooping import control_tests
-from ...solver.adjustment.statistics import PointAccuracy, global_test, mean_sigma, strongest_correlations
+from ...solver.adjustment.statistics import (
+    PointAccuracy,
+    global_test,
+    mean_sigma,
+    point_accuracy,
+    strongest_correlations,
+)
 from ...solver.adjustment.surface_control import SurfaceFit
 from ...solver.adjustment.variance_components import CONSTANTS, LEAST_REDUNDANCY
 from ...solver.camera.line_camera import LineCamera
@@ -269,13 +276,14 @@ def accuracies(result: BatchResult) -> dict[str, Any]:
     """
     network, points, sigma = result.network, result.adjusted_points(), result.point_sigma_m
     surveyed = result.kept_control
-    tie = np.ones(network.n_points, dtype=bool)
+    tie = result.solution.points.rank == 3
     tie[network.check.point] = tie[surveyed.point] = False
     reference = network.check if len(network.check) else surveyed
     direct = result.georeferenced
     return {
         "check": _accuracy(result.compare(network.check, points, sigma))
         | _expected(result, network.check, sigma, independent=True),
+        "check_single": _single_accuracy(single_looks(result.solution, result.cofactors, result.sigma0)),
         "control": _accuracy(result.compare(surveyed, points, sigma))
         | _expected(result, surveyed, sigma, independent=False),
         "tie": {"n": int(tie.sum()), "sigma_m": mean_sigma(sigma[tie]).tolist()},
@@ -302,6 +310,20 @@ def _expected(result: BatchResult, given: Control, sigma_m: Any, *, independent:
         return {}
     mean = np.maximum(variance, 0.0).sum(axis=0) / np.maximum(n, 1)
     return {"expected_m": np.where(n > 0, np.sqrt(mean), np.nan).tolist()}
+
+
+def _single_accuracy(alone: SingleLooks) -> dict[str, Any]:
+    """Accuracy of check points that their rays do not determine, at the given heights."""
+    if not len(alone.point):
+        return {"n": 0}
+    expected = np.sqrt(np.mean(np.square(alone.expected_m), axis=0))
+    found = _accuracy(point_accuracy(with_height(alone.difference_m), with_height(alone.sigma_m)))
+    return found | {"expected_m": [*expected.tolist(), np.nan]}
+
+
+def with_height(plane: Array) -> Array:
+    """X and Y (k, 2) with a height that is not compared (k, 3)."""
+    return np.column_stack([plane, np.full(len(plane), np.nan)])
 
 
 def _accuracy(a: PointAccuracy) -> dict[str, Any]:
@@ -359,9 +381,11 @@ def notes_of(adjustment: Adjustment) -> list[str]:
     notes += _weakness_notes(result)
     if result.doubtful:
         notes.append(_doubt_note(result))
-    lost = int(((solution.points.rank < 3) & (network.rays_per_point > 0)).sum())
-    if lost:
-        notes.append(f"{lost} object points are not determined by their rays and have no coordinates in points.csv")
+    lost = (solution.points.rank < 3) & (network.rays_per_point > 0)
+    if lost.any():
+        what = f"{int(lost.sum())} object points are not determined by their rays and have no coordinates in points.csv"
+        check = int(lost[network.check.point].sum())
+        notes.append(f"{what}; {check} of them are check points" if check else what)
     return notes
 
 

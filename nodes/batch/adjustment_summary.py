@@ -16,6 +16,7 @@ MOST_REJECTED = 10
 #: What the differences to given coordinates hold beside the errors of the points.
 _WITH_SURVEY = {
     "check": "from sigma and the survey's own",
+    "check_single": "from sigma and the survey's own",
     "control": "from the survey's sigma, as it took part",
     "direct_georeferencing": "from sigma and the survey's own",
 }
@@ -59,14 +60,18 @@ def _accuracy(c: Content) -> Iterator[str]:
     )
     for key, name in (
         ("check", "check points"),
+        ("check_single", "check points of one ray"),
         ("control", "control points"),
         ("direct_georeferencing", "direct georeferencing"),
     ):
-        a = c[key]
+        a = c.get(key, {"n": 0})
         if a["n"]:
             yield f"  {name:22s}{a['n']:5d} {_three(a['rmse_m'])} {_three(a['mean_m'])} {_three(a['sigma_m'])}"
             if _differ(a.get("expected_m"), a["sigma_m"]):
                 yield f"  {'  RMSE to be expected':27s} {_three(a['expected_m'])}  {_WITH_SURVEY[key]}"
+            if "rmse_px" in a:
+                found, wanted = ("{:.3f}, {:.3f}".format(*a[name]) for name in ("rmse_px", "expected_px"))
+                yield f"  {'':27s} at the given heights; line, sample: RMSE {found} px, {wanted} px to be expected"
     if c["tie"]["n"]:
         yield f"  {'tie points':22s}{c['tie']['n']:5d} {'':27s} {'':27s} {_three(c['tie']['sigma_m'])}"
     if "dem" in c:

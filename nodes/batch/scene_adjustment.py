@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from ...solver.models.base import Extent, ModelOptions
 from ...solver.orbit.time_scales import iso_utc
 from ...solver.scene_adjustment.images import CAMERA, IMAGE, ORIENTATION, ImageModel
 from ...solver.scene_adjustment.rigorous import CorrectionSet, RigorousImage, calibration_of, flight_axes_b
+from ...solver.scene_adjustment.single_looks import SingleLooks, single_looks
 from ...solver.scene_adjustment.snooping import SceneSnooping, snoop
 from ...solver.scene_adjustment.solution import (
     NotAdjustableError,
@@ -37,7 +39,7 @@ from ..errors import UserError
 from ..formats.satellite.rpc_files import write_rpb
 from ..formats.scene_block import ImageEntry, SceneBlockData
 from ..formats.table import write_table
-from .adjustment_result import HOPELESS, deserted_note, elsewhere, failing_note, reliability_summary
+from .adjustment_result import HOPELESS, deserted_note, elsewhere, failing_note, reliability_summary, with_height
 from .json_values import plain
 from .two_steps import sigmas_stated, step_settings
 
@@ -112,6 +114,11 @@ class SceneAdjustment:
     def test(self) -> GlobalTest:
         """Chi-square test of sigma0."""
         return _test(self.solution)
+
+    @cached_property
+    def single_looks(self) -> SingleLooks:
+        """Rays of check points that nothing else determines."""
+        return single_looks(self.solution, self.test.sigma0)
 
     def values_of(self, image: int) -> Array:
         """Unknowns of an image."""
@@ -391,16 +398,36 @@ def _accuracies(a: SceneAdjustment) -> dict[str, Any]:
     tie = a.solution.determined.copy()
     tie[known.point] = False
     found["tie"] = {"n": int(tie.sum()), "sigma_m": mean_sigma(sigma[tie]).tolist()}
+    alone = a.single_looks
+    found["check_single"] = _single_accuracy(alone)
     against = "check" if "check" in known.role else "control"
     k = _known(a, against)
     locating = np.array([image.locates for image in block.images])[block.rays.image]
     first, solution = a.before or (a.problem, a.solution)
-    position, determined = intersect(first, _beforehand(first, solution), locating)
-    k = k[determined[known.point[k]]] if len(k) else k
-    points = known.point[k]
-    d = points_enu(a.problem, position, known.position_e[k], points)
+    beforehand = _beforehand(first, solution)
+    if not len(k) and len(alone.rays):
+        direct = single_looks(replace(solution, determined=a.solution.determined), 1.0, beforehand)
+        d, against = with_height(direct.difference_m[locating[direct.rays]]), "check_single"
+    else:
+        position, determined = intersect(first, beforehand, locating)
+        k = k[determined[known.point[k]]] if len(k) else k
+        d = points_enu(a.problem, position, known.position_e[k], known.point[k])
     found["direct_georeferencing"] = _accuracy(d, np.full_like(d, np.nan)) | {"against": against}
     return found
+
+
+def _single_accuracy(alone: SingleLooks) -> dict[str, Any]:
+    """Accuracy of the rays of check points that nothing else determines, at the given heights."""
+    if not len(alone.rays):
+        return {"n": 0}
+    v, expected = alone.residual_px, np.sqrt(np.mean(np.square(alone.expected_m), axis=0))
+    return _accuracy(with_height(alone.difference_m), with_height(alone.sigma_m)) | {
+        "expected_m": [*expected.tolist(), np.nan],
+        "rmse_px": np.sqrt(np.mean(np.square(v), axis=0)).tolist(),
+        "mean_px": v.mean(axis=0).tolist(),
+        "max_px": np.abs(v).max(axis=0).tolist(),
+        "expected_px": np.sqrt(np.mean(np.square(alone.sigma_px), axis=0)).tolist(),
+    }
 
 
 def _expected(a: SceneAdjustment, sigma: Array, survey: Array, *, independent: bool) -> dict[str, Any]:
@@ -486,7 +513,9 @@ def _correlations(a: SceneAdjustment, sigma: Array) -> list[dict[str, Any]]:
 def _notes(a: SceneAdjustment) -> list[str]:
     notes = list(a.data.notes)
     s, data = a.solution, a.data
-    lost = [data.point_ids[p] for p in np.flatnonzero(~s.determined) if (data.rays.point == p).any()]
+    alone = np.unique(data.rays.point[a.single_looks.rays])
+    undetermined = np.setdiff1d(np.flatnonzero(~s.determined), alone)
+    lost = [data.point_ids[p] for p in undetermined if (data.rays.point == p).any()]
     if lost:
         shown = ", ".join(lost[:5]) + (f" and {len(lost) - 5} more" if len(lost) > 5 else "")
         notes.append(f"{len(lost)} points are not determined by their rays and were left out: {shown}")
@@ -497,6 +526,7 @@ def _notes(a: SceneAdjustment) -> list[str]:
         share = 100 * a.snooping.given_up
         notes.append(f"data snooping given up: {share:.0f} % of the image points would go; model or sigmas are wrong")
     notes += _control_notes(a)
+    notes += _single_look_note(a)
     if a.before is not None and not a.before[1].converged:
         notes.append(f"the first of two steps has not converged after {a.before[1].iterations} iterations")
     if not s.converged:
@@ -524,6 +554,21 @@ def _control_notes(a: SceneAdjustment) -> list[str]:
         what = f"no control point of {n} is measured in an image" if n else "no control"
         return [f"{what}: position and attitude of the block come from the a-priori sigmas of its orbits"]
     return [f"{never} of {n} control points are measured in no image", *said] if never else said
+
+
+def _single_look_note(a: SceneAdjustment) -> list[str]:
+    """Pixels of check points of one ray that lie elsewhere than the adjusted image says; nothing where none do."""
+    alone = a.single_looks
+    worst = [(i, k) for i, k in np.argwhere(np.abs(alone.test) > a.job.critical)]
+    worst.sort(key=lambda key: -abs(alone.test[key]))
+    if not worst:
+        return []
+    shown = (
+        f"{a.data.point_ids[a.data.rays.point[alone.rays[i]]]} {('line', 'sample')[k]} ({alone.test[i, k]:+.1f})"
+        for i, k in worst[:5]
+    )
+    more = " ..." if len(worst) > 5 else ""
+    return [f"{len(worst)} pixels of check points have |w| > {a.job.critical:g}: {', '.join(shown)}{more}"]
 
 
 # tables
@@ -575,8 +620,10 @@ def _write_residuals(a: SceneAdjustment, path: Path) -> None:
     }
     formats = {"line": ".5f", "sample": ".5f"}
     detectable = np.where(np.isfinite(r.detectable), r.detectable, np.nan)
+    w = s.test.copy()
+    w[a.single_looks.rays] = a.single_looks.test
     for name, values, spec in (
-        ("v_{}_px", s.residual_px, ".5f"), ("w_{}", s.test, ".4f"), ("redundancy_{}", r.redundancy, ".5f"),
+        ("v_{}_px", s.residual_px, ".5f"), ("w_{}", w, ".4f"), ("redundancy_{}", r.redundancy, ".5f"),
         ("detectable_{}_px", detectable, ".4f"),
     ):  # fmt: skip
         for k, coordinate in enumerate(("line", "sample")):

@@ -108,6 +108,44 @@ def test_expected_rmse_of_check_points_and_control_holds_the_survey(tmp_path, ca
     assert 0.7 < np.sqrt(np.mean(np.square(control))) < 1.3
 
 
+def test_check_points_of_a_scene_alone_are_compared_at_their_heights(tmp_path, capsys):
+    """They were left out as not determined; beside the written polynomials, and one pixel that is off is named."""
+    folder, out = tmp_path / "one", tmp_path / "result"
+    arguments = ["--satellite", "spot5-hrs", "--points", "24", "--control", "9", "--check", "15", "--seed", "2"]
+    assert main(["simulate", "-q", "-o", str(folder), *arguments]) == 0
+    image = pd.read_csv(folder / "image_points.csv")
+    image = image[image.ccd == "F"]
+    image.loc[image.point == "P12", "sample"] += 6.0
+    image.to_csv(folder / "image_points.csv", index=False)
+    capsys.readouterr()
+    assert main(["adjust", str(folder), "-o", str(out)]) == 0
+    printed = capsys.readouterr().out
+    result = json.loads((out / "result.json").read_text())
+    single = result["check_single"]
+    assert result["check"]["n"] == 0 and single["n"] == 15 and single["rmse_m"][2] is None
+    assert re.search(r"check points of one ray +15 ", printed) and " px to be expected" in printed
+    assert any(re.match(r"1 pixels of check points .*: P12 sample \(\+\d", note) for note in result["notes"])
+    assert not any("P12" in note or "P13" in note for note in result["notes"] if "not determined" in note)
+    assert result["direct_georeferencing"]["against"] == "check_single"
+    assert result["direct_georeferencing"]["rmse_m"][0] > 3.0 * single["rmse_m"][0]
+    ground = pd.read_csv(folder / "ground_points.csv").set_index("point")
+    check = image[image.point.isin(ground.index[ground.role == "check"])]
+    given = ground.loc[check.point]
+    rpc = read_scene(out / "rpc" / "scene_F.RPB").rpc
+    lat, lon, _ = rpc.direct(check.line.to_numpy(), check["sample"].to_numpy(), given.Z_m.to_numpy()).T
+    metres = 6_378_137.0 * np.cos(np.radians(36.0)), 6_358_000.0
+    off = [np.radians(given.X_m.to_numpy()), np.radians(given.Y_m.to_numpy())]
+    for k, found in enumerate((lon, lat)):
+        difference = (found - off[k]) * metres[k]
+        np.testing.assert_allclose(np.sqrt(np.mean(difference**2)), single["rmse_m"][k], rtol=0.02)
+    table = pd.read_csv(out / "residuals.csv").set_index("point").loc[check.point]
+    pixel = rpc.inverse(*np.radians([given.Y_m.to_numpy(), given.X_m.to_numpy()]), given.Z_m.to_numpy())
+    v = table[["v_line_px", "v_sample_px"]].to_numpy()
+    np.testing.assert_allclose(check[["line", "sample"]].to_numpy() - pixel, v, atol=5e-3)
+    np.testing.assert_allclose(single["rmse_px"], np.sqrt(np.mean(v**2, axis=0)), rtol=1e-4)
+    assert abs(table.w_sample["P12"]) > 10.0 and np.abs(table.drop("P12")[["w_line", "w_sample"]]).max().max() < 4.0
+
+
 def test_what_is_known_of_the_orbit_counts_once_in_two_models(block, capsys):
     """A second model finds next to nothing beside its a-priori sigmas; those stated for it alone are knowledge."""
     found = []

@@ -14,6 +14,7 @@ from triline.solver.location.rpc_fit import fit_to_model
 from triline.solver.models.dgr import DgrOptions
 from triline.solver.scene_adjustment.block import GIVEN, KnownGround, SceneBlock
 from triline.solver.scene_adjustment.functional import ProjectiveImage, RpcImage
+from triline.solver.scene_adjustment.single_looks import single_looks
 from triline.solver.scene_adjustment.snooping import snoop
 from triline.solver.scene_adjustment.solution import NotAdjustableError, adjust, points_enu, prepare
 from triline.solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass
@@ -323,6 +324,33 @@ def test_points_with_one_ray_are_left_out_and_planimetric_and_height_control_cou
     assert np.isnan(solution.points_covariance[20]).all()
     assert solution.n_observations == 2 * (len(rays) - 1) + 27 + 2 * 2 + 2 * 1 + 2 * 3
     assert solution.n_unknowns == 27 + 3 * 29
+
+
+def test_check_points_of_a_scene_alone_lie_off_by_as_much_as_their_sigmas_say():
+    """Of one image no check point is determined; those that are given are as far off as stated."""
+    w, ground = [], []
+    for seed in range(25):
+        simulation = simulated("spot5-hrs", points=12, seed=seed)
+        block = simulation.block
+        of_one = block.rays.image == 0
+        rays = replace(
+            block.rays, **{k: getattr(block.rays, k)[of_one] for k in ("image", "point", "line", "sample", "sigma_px")}
+        )
+        rng, known = np.random.default_rng(seed), block.known
+        check = np.array([role == "check" for role in known.role])
+        stated = np.where(check[:, None, None], np.diag([6.0, 9.0, 12.0]) ** 2, known.covariance_enu)
+        survey = rng.normal(size=(len(check), 3)) * [6.0, 9.0, 12.0] * check[:, None]
+        axes = prepare(block).R_e_enu[known.point]
+        given = known.position_e + np.einsum("kij,kj->ki", axes, survey)
+        known = replace(known, covariance_enu=stated, position_e=given)
+        solution = adjust(prepare(replace(block, images=block.images[:1], rays=rays, known=known)))
+        found = single_looks(solution, 1.0)
+        assert len(found.rays) == 6 and not solution.determined[rays.point[found.rays]].any()
+        w.append(found.test)
+        ground.append(found.difference_m / found.expected_m)
+        assert (found.expected_m > found.sigma_m).all()
+    for values in (np.concatenate(w), np.concatenate(ground)):
+        assert 0.85 < np.sqrt(np.mean(values**2)) < 1.15
 
 
 def test_blocks_that_cannot_be_adjusted_are_refused_in_one_line():
