@@ -552,7 +552,8 @@ def _control_notes(a: SceneAdjustment) -> list[str]:
     n, never = np.count_nonzero(given), np.count_nonzero(given & ~measured)
     if never == n:
         what = f"no control point of {n} is measured in an image" if n else "no control"
-        return [f"{what}: position and attitude of the block come from the a-priori sigmas of its orbits"]
+        of = "orbits" if _rigorous(a) else "polynomials"
+        return [f"{what}: where the block lies comes from the a-priori sigmas of its {of}"]
     return [f"{never} of {n} control points are measured in no image", *said] if never else said
 
 

@@ -25,6 +25,10 @@ KINDS: dict[str, Any] = {
 }
 
 
+#: Addresses that two programs cannot read at once: each would have a part of what comes, or none.
+ALONE = ("serial:", "udp:", "listen:")
+
+
 @dataclass(frozen=True)
 class SensorProgram:
     """A program that a flight starts.
@@ -57,6 +61,9 @@ def read_sensors(flight: Flight) -> list[SensorProgram]:
             continue
         if program.id in [other.id for other in programs]:
             flight.problems.append(str(keys.refuse("id", "another name for each sensor")))
+        address = str(program.settings.get("address", ""))
+        if address.startswith(ALONE) and address in [other.settings.get("address") for other in programs]:
+            flight.problems.append(str(keys.refuse("address", "another one for each sensor: one program reads a port")))
         programs.append(program)
     cameras = [program.id for program in programs if program.node == "ros2" and program.settings.get("images")]
     if len(cameras) > 1:

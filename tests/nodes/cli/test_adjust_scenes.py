@@ -283,7 +283,10 @@ def test_control_by_names_that_no_image_point_has_is_told(block, capsys):
     control = np.flatnonzero(known["role"] == "control")
     for some, told in (
         (control[:2], "2 of 9 control points are measured in no image"),
-        (control[2:], "no control point of 9 is measured in an image: position and attitude of the block come from"),
+        (
+            control[2:],
+            "no control point of 9 is measured in an image: where the block lies comes from the a-priori sigmas",
+        ),
     ):
         known.loc[some, "point"] = "G" + known.loc[some, "point"]
         known.to_csv(block / "ground_points.csv", index=False)

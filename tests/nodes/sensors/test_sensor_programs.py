@@ -116,6 +116,11 @@ WRONG = {
     "id": ('id = "camera"', 'id = "my camera"', "sensor[1].id: 'my camera', wanted a word of letters"),
     "id of a node": ('id = "camera"', 'id = "navigator"', "sensor[1].id: 'navigator', wanted another name, for a node"),
     "twice": ('id = "camera"', 'id = "nmea"', "sensor[1].id: 'nmea', wanted another name for each sensor"),
+    "port": (
+        "[nodes.matcher]",
+        '[[sensor]]\nkind = "stream"\nid = "imu"\naddress = "listen://127.0.0.1:5555"\n[nodes.matcher]',
+        "sensor[3].address: 'listen://127.0.0.1:5555', wanted another one for each sensor: one program reads a port",
+    ),
     "CCD line": ("{N =", "{Q =", "sensor[2].images: CCD line 'Q', wanted F, N, B"),
     "band": ('"file:gnss.nmea"', '"gnss.nmea"', "sensor[0].address: 'gnss.nmea', wanted serial:PORT"),
     "time": ("09:30:00Z\nline_rate_hz = 100\n[[sensor]]", "\n[[sensor]]", "not valid TOML"),
