@@ -164,9 +164,15 @@ def camera_of_table(table: Path) -> Path:
     return table.with_name(f"{table.stem}_camera.json")
 
 
-def camera_beside(trajectory: Path, camera: LineCamera) -> tuple[LineCamera, Path | None]:
+def camera_beside(
+    trajectory: Path, camera: LineCamera, notes: list[str] | None = None
+) -> tuple[LineCamera, Path | None]:
     """The calibrated camera that stands beside a table of orientation and goes with it: that of the table, which
     `triline export` writes, or that of the folder, which `triline adjust` does.
+
+    Parameters
+    ----------
+    notes : gets remarks on the file
 
     Returns
     -------
@@ -179,7 +185,7 @@ def camera_beside(trajectory: Path, camera: LineCamera) -> tuple[LineCamera, Pat
     """
     for path in (camera_of_table(trajectory), trajectory.parent / "camera.json"):
         if path.exists():
-            return read_camera_instead(path, camera, f"stands beside {trajectory.name} and "), path
+            return read_camera_instead(path, camera, f"stands beside {trajectory.name} and ", notes), path
     return camera, None
 
 

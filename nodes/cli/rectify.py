@@ -120,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
         "pixels_together": factor, "camera_parameters": of.estimated, "camera": of.of_camera and str(of.of_camera),
         "sigma": args.sigma, "strips": done.strips, "left_out": done.left_out, "missed_rays": done.missed_rays,
         "poses_not_valid": of.orientation.not_valid,
-        "notes": notes_of_map(grid.frame.crs, project_frame(recording).crs),
+        "notes": [*of.notes, *notes_of_map(grid.frame.crs, project_frame(recording).crs)],
         "seconds": round(time.perf_counter() - begun, 3),
     }  # fmt: skip
     _tell(result, done, args, grid.frame.units[0])

@@ -51,6 +51,7 @@ class Prepared:
     surface, ground : what rays meet, and its name
     errors : what counts for the sigmas besides the orientation, None where nobody asked for them
     pixel_m : size of a pixel on the ground
+    notes : remarks on the camera's file
     """
 
     recording: Recording
@@ -66,6 +67,7 @@ class Prepared:
     ground: str
     errors: GroundErrors | None
     pixel_m: float
+    notes: tuple[str, ...]
 
 
 def prepared(args: argparse.Namespace, path: Path) -> Prepared:
@@ -81,16 +83,17 @@ def prepared(args: argparse.Namespace, path: Path) -> Prepared:
     if not args.mosaic:
         check_strips(recording, args.strip)
     of_camera = None
+    notes: list[str] = []
     if args.trajectory is not None:
         name = args.trajectory.name
         orientation, reference_ns = trajectory_orientation(recording, args.trajectory)
         if args.camera is None:
-            camera, of_camera = camera_beside(args.trajectory, camera)
+            camera, of_camera = camera_beside(args.trajectory, camera, notes)
     else:
         name, orientation, reference_ns = orientation_of(recording, args.orientation)
     estimated = 0
     if args.camera is not None:
-        camera, of_camera = read_camera_instead(args.camera, camera), args.camera
+        camera, of_camera = read_camera_instead(args.camera, camera, notes=notes), args.camera
     elif name in REFINED:
         camera, estimated = estimated_camera(recording, camera)
     frame = project_frame(recording)
@@ -105,7 +108,7 @@ def prepared(args: argparse.Namespace, path: Path) -> Prepared:
         raise UserError(f"{path}: the camera is {-above:.0f} m below the ground; wanted another --height or --dem")
     return Prepared(
         recording, camera, ccd, name, orientation, reference_ns, estimated, of_camera, target, surface, ground, errors,
-        pixel_on_ground(camera, ccd, above),
+        pixel_on_ground(camera, ccd, above), tuple(notes),
     )  # fmt: skip
 
 

@@ -169,8 +169,11 @@ def test_orientation_of_an_adjustment_goes_with_the_camera_that_it_calibrated(fl
     assert told["camera"] == str(out / "camera.json")
     with rasterio.open(folder / "named.tif") as image:
         np.testing.assert_array_equal(image.read(1), whole["orientation_lines.csv"][0])
+    misspelt = json.loads((out / "camera.json").read_text()) | {"distorsion": [0.0]}
+    (out / "camera.json").write_text(json.dumps(misspelt))
     told = _rectify(capsys, flown, folder / "named.tif", "--camera", out / "camera.json", "--height", 0)
     assert told["camera"] == str(out / "camera.json") and not told["camera_parameters"]
+    assert any("distorsion" in note for note in told["notes"])
     # a camera that is 40 pixels off across the track takes the orthoimage along
     table = out / "camera_N.csv"
     rows = np.loadtxt(table, delimiter=",", skiprows=1)
