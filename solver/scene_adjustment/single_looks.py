@@ -63,9 +63,9 @@ def single_looks(solution: SceneSolution, sigma0: float, state: State | None = N
     at = known.point[check]
     place[at], survey[at] = known.position_e[check], np.nan_to_num(known.covariance_enu[check])
     place[solution.determined] = np.nan
-    alone = np.isfinite(place).all(axis=1)
+    alone = np.asarray(np.isfinite(place).all(axis=1))
     place = np.where(alone[:, None], place, solution.state.position_e)
-    rays: list[Array] = []
+    rays: list[NDArray[np.int64]] = []
     parts: list[tuple[Array, ...]] = []
     for image, mine, columns in zip(problem.rays, block.rays_of, block.layout.columns, strict=True):
         p = block.rays.point[mine]
