@@ -163,15 +163,15 @@ def write_trajectory(
 ) -> int:
     """Write trajectory.csv: a row for each inertial sample (gaps filled), or at a rate; returns the number of rows."""
     settings = folder.platform.settings
-    full = inertial.bridged(settings.gap_rate_sigma, settings.gap_force_sigma).time_s
-    digits = 9 if full[-1] + folder.offset_s < 1e7 else 6
+    digits = 9 if inertial.time_s[-1] + folder.offset_s < 1e7 else 6
     line = f"%.{digits}f,%.10f,%.10f,%.5f,%.6f,%.6f,%.6f,%.7f,%.7f,%.7f" + ",%.6g" * 9
     rows = 0
     with open(path, "w", encoding="utf-8", newline="") as file:
         file.write(",".join(COLUMNS) + "\n")
         for stretch in stretches:
             trajectory = stretch.best
-            time_s = full[(full >= trajectory.start_s) & (full <= trajectory.end_s)]
+            flown = inertial[(inertial.time_s >= trajectory.start_s) & (inertial.time_s <= trajectory.end_s)]
+            time_s = flown.bridged(settings.gap_rate_sigma, settings.gap_force_sigma).time_s
             if rate_hz is not None:
                 first, last = np.ceil(trajectory.start_s * rate_hz), np.floor(trajectory.end_s * rate_hz)
                 time_s = np.arange(first, last + 1) / rate_hz

@@ -183,7 +183,7 @@ def read_sensor_folder(path: str | Path, platform_file: Path | None = None) -> S
     attitude = _read_attitude(folder / "attitude.csv", notes)
     platform = read_platform(platform_file or folder / "platform.toml", notes)
     if platform.initial is None and attitude is not None and time is not None:
-        initial = _initial_of(attitude, float(time[0]))
+        initial = _initial_of(attitude, float(time.min()))
         platform = Platform(**{**vars(platform), "initial": initial})
     return SensorFolder(folder, time, rotation, force, increments, gnss, attitude, platform, notes)
 

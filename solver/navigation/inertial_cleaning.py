@@ -66,9 +66,12 @@ def clean_inertial(
         possible, more = _possible(t, a, b, np.flatnonzero(good), increments)
         findings += more
         t, a, b = t[possible], a[possible], b[possible]
+        rows, more = _in_order(t, "imu.time", "samples")
+        findings += more
+        t, a, b = t[rows], a[rows], b[rows]
         step = np.diff(t)
-        nominal = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
-        early = np.flatnonzero((step[:4] <= 0) | (step[:4] > max(20.0 * nominal, nominal + 0.2)))
+        nominal = float(np.median(step)) if len(step) else 0.0
+        early = np.flatnonzero(step[:4] > max(20.0 * nominal, nominal + 0.2))
         if len(early) and nominal > 0:
             k = int(early[-1]) + 1
             what = (
@@ -76,11 +79,6 @@ def clean_inertial(
             )
             findings.append(Finding("first interval", "imu.time", what, False))
             t, a, b = t[k:], a[k:], b[k:]
-        t, a, b, back = _increasing(t, a, b)
-        if back:
-            findings.append(
-                Finding("time order", "imu.time", f"{back} samples repeat or go back in time: dropped", False)
-            )
     return t, a, b, findings
 
 
@@ -107,10 +105,30 @@ def _possible(
     return possible, findings
 
 
-def _increasing(t: Array, a: Array, b: Array) -> tuple[Array, Array, Array, int]:
-    newest = np.maximum.accumulate(t)
-    keep = np.concatenate([[True], t[1:] > newest[:-1]])
-    return t[keep], a[keep], b[keep], int((~keep).sum())
+def _in_order(time_s: Array, subject: str, name: str) -> tuple[NDArray[np.intp], list[Finding]]:
+    """Rows whose times (n,) increase, in that order, and what is to be said of it.
+
+    Rows are kept in runs without a gap, which are put in the order of their beginnings: a file may have its parts in
+    another order, and a single stamp that is far ahead does not make all that follow seem late. What goes back within
+    that is left out, so that runs which overlap, as of a clock that was set back, are not mixed.
+    """
+    step = np.diff(time_s)
+    if not len(step) or (step > 0).all():
+        return np.arange(len(time_s)), []
+    sorted_step = np.diff(np.sort(time_s))
+    usual = float(np.median(sorted_step[sorted_step > 0])) if (sorted_step > 0).any() else 0.0
+    runs = np.split(np.arange(len(time_s)), np.flatnonzero((step <= 0) | (step > GAP_FACTOR * usual)) + 1)
+    rows = np.concatenate(sorted(runs, key=lambda run: float(time_s[run[0]])))
+    newest = np.maximum.accumulate(time_s[rows])
+    rows = rows[np.concatenate([[True], time_s[rows[1:]] > newest[:-1]])]
+    findings = []
+    if (np.diff(rows) < 0).any():
+        text = f"{name} go back in time at {int((step < 0).sum())} place(s): put in order"
+        findings.append(Finding("time order", subject, text, False))
+    if len(rows) < len(time_s):
+        text = f"{len(time_s) - len(rows)} {name} repeat or go back in time: dropped"
+        findings.append(Finding("time order", subject, text, False))
+    return rows, findings
 
 
 def clean_gnss(gnss: GnssData) -> tuple[GnssData, list[Finding]]:
@@ -137,13 +155,9 @@ def clean_gnss(gnss: GnssData) -> tuple[GnssData, list[Finding]]:
         text = f"{value:g}, wanted {'-90 to 90' if k == 0 else '-360 to 360'} deg: fix dropped{more}"
         findings.append(Finding("not geodetic", "gnss.position", text, False, (int(rows[i]), k)))
         gnss = gnss[np.flatnonzero(~off.any(axis=1))]
-    if len(gnss):
-        newest = np.maximum.accumulate(gnss.time_s)
-        keep = np.concatenate([[True], gnss.time_s[1:] > newest[:-1]])
-        if not keep.all():
-            text = f"{int((~keep).sum())} fixes repeat or go back in time: dropped"
-            findings.append(Finding("time order", "gnss.time", text, False))
-            gnss = gnss[keep]
+    order, more = _in_order(gnss.time_s, "gnss.time", "fixes")
+    findings += more
+    gnss = gnss[order]
     if len(gnss) and (np.abs(gnss.lat).max() > np.pi / 2 or np.abs(gnss.lon).max() > 2 * np.pi):
         text = "latitude beyond 90 deg or longitude beyond 360 deg: not degrees, or the columns are swapped"
         findings.append(Finding("not geodetic", "gnss.position", text, True))

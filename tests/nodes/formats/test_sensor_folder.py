@@ -131,6 +131,16 @@ def test_gaps_are_filled_and_named(tmp_path, capsys):
     assert np.diff(rows[:, 0]).max() < 0.011 and np.isfinite(rows).all()
 
 
+def test_a_last_time_that_is_wrong_makes_no_rows(tmp_path, capsys):
+    folder = write(tmp_path / "flight")
+    lines = (folder / "imu.csv").read_text().splitlines()
+    lines[-1] = "1e9," + lines[-1].split(",", 1)[1]
+    (folder / "imu.csv").write_text("\n".join(lines) + "\n")
+    assert main(["navigate", str(folder), "-o", str(tmp_path / "out"), "--no-page"]) == 0
+    rows = np.loadtxt(tmp_path / "out" / "trajectory.csv", delimiter=",", skiprows=1)
+    assert len(rows) == len(lines) - 2 and rows[-1, 0] < 100.0
+
+
 def test_initial_attitude_from_platform_and_from_attitude_csv(tmp_path, capsys):
     roll, pitch, heading = np.degrees(flight().motion.at(0.5).angles[0])
     initial = (

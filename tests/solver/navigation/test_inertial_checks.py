@@ -187,6 +187,28 @@ def test_garbage_first_interval_and_disorder_are_taken_out():
     assert {f.code for f in findings} == {"time order", "not finite"}
 
 
+def test_parts_in_another_order_and_single_stamps_far_off_cost_no_others():
+    t, x = 100.0 + 0.01 * np.arange(2000), np.zeros((2000, 3))
+    x[:, 0] = np.arange(2000)
+    rows = np.r_[1200:2000, 0:1200]
+    time, a, _, findings = clean_inertial(t[rows], x[rows], x[rows])
+    assert (time == t).all() and (a == x).all()
+    assert [f.text for f in findings] == ["samples go back in time at 1 place(s): put in order"]
+    for stamp, left in ((1e9, 2000), (104.0, 1999), (112.0, 1999), (50.0, 1999)):
+        off = t.copy()
+        off[700] = stamp
+        time, a, _, findings = clean_inertial(off, x, x)
+        assert len(time) == left and (np.diff(time) > 0).all() and findings
+        assert (np.delete(a[:, 0], np.flatnonzero(a[:, 0] == 700)) == np.delete(x[:, 0], 700)).all()
+    back = np.where(np.arange(2000) < 1000, t, t - 2.0)  # a clock that is set back: overlapping samples are not mixed
+    time, a, _, _ = clean_inertial(back, x, x)
+    assert len(time) == 1800 and (np.diff(a[:, 0]) > 0).all()
+    _, g, _ = data()
+    shuffled, findings = clean_gnss(g[np.random.default_rng(0).permutation(len(g))])
+    assert (shuffled.time_s == g.time_s).all() and (shuffled.lat == g.lat).all()
+    assert "put in order" in findings[0].text
+
+
 @pytest.mark.parametrize("increments", [False, True])
 def test_impossible_samples_are_taken_out_and_hard_turns_are_not(increments):
     t, factor = 100.0 + 0.01 * np.arange(2000), 0.01 if increments else 1.0
