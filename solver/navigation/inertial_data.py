@@ -250,7 +250,8 @@ def _checked(time_s: ArrayLike, a: ArrayLike, b: ArrayLike) -> tuple[Array, Arra
     if not (step > 0).all():
         raise ValueError(f"times of inertial data must increase; sample {int(np.argmin(step > 0)) + 1} does not")
     nominal = float(np.median(step))
-    dt = np.concatenate([[nominal], np.where(step > GAP_FACTOR * nominal, nominal, step)])
+    late = np.append(step[:-1] + step[1:], np.inf) < (1.0 + GAP_FACTOR) * nominal  # the next stamp makes up for it
+    dt = np.concatenate([[nominal], np.where((step > GAP_FACTOR * nominal) & ~late, nominal, step)])
     return time, dt, a, b
 
 

@@ -264,6 +264,16 @@ def test_gaps_are_found_and_filled_with_noise():
     assert p.bridged(0.05, 0.5) is p
 
 
+def test_a_stamp_that_is_late_is_no_gap():
+    p = pieces(100)
+    late = p.time_s.copy()
+    late[40] += 0.8 * p.interval_s
+    of_late = InertialData.from_increments(late, p.dtheta, p.dv)
+    assert not of_late.gaps() and of_late.dt_s.sum() == pytest.approx(p.dt_s.sum())
+    lost = InertialData.from_increments(*(np.delete(x, 41, 0) for x in (late, p.dtheta, p.dv)))
+    assert len(lost.gaps()) == 1
+
+
 @pytest.mark.parametrize(
     ("time_s", "rate", "words"),
     [
