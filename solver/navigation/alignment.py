@@ -54,6 +54,10 @@ class AlignmentError(ValueError):
     """The attitude cannot be found from the data; the message says why and what would help."""
 
 
+class NothingSeenError(AlignmentError):
+    """The data are too few, or of a platform that does not move; later ones may show the attitude."""
+
+
 @dataclass(frozen=True)
 class AttitudePrior:
     """Attitude known beforehand at a time.
@@ -120,15 +124,17 @@ def align(
 
     Raises
     ------
-    AlignmentError : too few fixes, or the heading stays unknown
+    NothingSeenError : too few fixes, or the heading stays unknown
+    AlignmentError : the data do not fit
     """
     t0 = float(inertial.time_s[0] - inertial.dt_s[0]) if start_s is None else start_s
     last = float(inertial.time_s[-1])
-    inside = gnss[(gnss.time_s >= t0) & (gnss.time_s <= min(last, t0 + _WINDOWS_S[-1]))]
+    until = min(last, t0 + _WINDOWS_S[-1])
+    inside = gnss[(gnss.time_s >= t0) & (gnss.time_s <= until)]
     if len(inside) < 4:
-        raise AlignmentError(
+        raise NothingSeenError(
             "alignment needs at least 4 GNSS fixes within the inertial data "
-            f"({t0 + offset_s:.1f} to {last + offset_s:.1f} s); {len(inside)} of {len(gnss)} are there"
+            f"({t0 + offset_s:.1f} to {until + offset_s:.1f} s); {len(inside)} of {len(gnss)} are there"
         )
     inside = _thinned(inside)
     data = inertial[(inertial.time_s > t0) & (inertial.time_s < inside.time_s[-1] + 1.0)]
@@ -182,7 +188,7 @@ def align(
             f"inertial and GNSS data do not fit over the first {seen:.0f} s (squares {chi2:.0f} times too large): "
             "check units, axes, time scales and sigmas"
         )
-    raise AlignmentError(
+    raise NothingSeenError(
         f"heading cannot be found: after {seen:.0f} s its sigma is {np.degrees(min(heading_sigma, np.pi)):.0f} deg "
         "(no turn, change of speed or course shows it, and the gyros are too coarse for gyro-compassing); give one "
         "with its sigma ([initial] heading_deg in platform.toml) or start in motion"

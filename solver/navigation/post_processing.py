@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .alignment import AlignmentError, AttitudePrior, align
+from .alignment import AlignmentError, AttitudePrior, NothingSeenError, align
 from .carried import NavigationTrajectory
 from .error_state import Innovation, NavigationSettings, Observation, Start, sensor_covariance
 from .filter_pass import FilterPass, run_filter
@@ -101,7 +101,7 @@ def navigate(
     for i, stretch in enumerate(_stretches(inertial, settings.longest_gap_s)):
         used = gnss[~withheld]
         try:
-            start = align(stretch, used, settings, prior=prior if i == 0 else None, offset_s=offset_s)
+            start = _aligned(stretch, used, settings, prior if i == 0 else None, offset_s)
         except AlignmentError as error:
             failed.append(Finding("alignment", "alignment", str(error), True))
             continue
@@ -126,6 +126,37 @@ def navigate(
     for f in failed:
         out[0].findings.append(Finding(f.code, f.subject, f"a stretch was left out: {f.text}", False))
     return out
+
+
+#: Where nothing shows the attitude, an alignment is tried again so much later, s, or, of a platform that stands, so
+#: long before it leaves its place. Tuned: shorter than the windows of an alignment, and long enough to level.
+_LATER_S, _BEFORE_S = 130.0, 20.0
+
+
+def _aligned(
+    stretch: InertialData, gnss: GnssData, settings: NavigationSettings, prior: AttitudePrior | None, offset_s: float
+) -> Start:
+    """Start at the beginning of a stretch, else where its data begin to show the attitude: many stand long before."""
+    try:
+        return align(stretch, gnss, settings, prior=prior, offset_s=offset_s)
+    except NothingSeenError as error:
+        first = error
+    begin = float(stretch.time_s[0] - stretch.dt_s[0])
+    while True:
+        later = gnss[(gnss.time_s >= begin + _LATER_S) & (gnss.time_s < stretch.time_s[-1])]
+        if not len(later):
+            raise first
+        position = later.position_e
+        leaves = np.linalg.norm(position - position[0], axis=1) > 2.0 + 5.0 * later.sigma_ned_m.max(axis=1)
+        if not leaves.any():
+            raise first
+        begin = max(float(later.time_s[0]), float(later.time_s[np.argmax(leaves)]) - _BEFORE_S)
+        try:
+            start = align(stretch, gnss, settings, start_s=begin, offset_s=offset_s)
+        except NothingSeenError:
+            continue
+        start.notes.append(f"nothing shows the attitude before: navigation begins at {begin + offset_s:.1f} s")
+        return start
 
 
 #: Changes of the biases that are tried where innovations are too large: correlation time (s), factor on the sigmas.

@@ -419,6 +419,18 @@ def test_long_gap_divides_and_short_gap_is_bridged():
     assert [round(p.best.end_s) for p in parts] == [100, 300] and round(parts[1].best.start_s) == 130
 
 
+@pytest.mark.parametrize("fixes_from_s", [0.0, 330.0])
+def test_a_flight_that_stands_for_long_or_gets_its_fixes_late_begins_where_the_attitude_shows(fixes_from_s):
+    f = sim.flight("mems", duration_s=480.0, seed=34, rate_hz=50, static_s=350.0, line_s=30.0)
+    (r,) = navigate(f.inertial, f.gnss[f.gnss.time_s > fixes_from_s], f.settings, offset_s=1000.0)
+    begin = r.best.start_s
+    assert 325.0 < begin < 365.0
+    assert any(f"navigation begins at {1000.0 + begin:.1f} s" in x.text for x in r.findings)
+    later = np.arange(begin + 30.0, 475.0)
+    z = sim.errors(r.smoothed, f.motion, later) / r.smoothed.sigmas(later)
+    assert sim.rms(z).max() < 2.0
+
+
 @pytest.mark.parametrize("scales", [(2e-4, 0.0), (0.0, 2e-4)])
 def test_scale_factors_of_one_kind_of_sensor(scales):
     gyro, accel = scales
