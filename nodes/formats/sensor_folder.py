@@ -12,7 +12,7 @@ from ...solver.geometry.rotation import R_BC_NOMINAL, matrix_from_navigation
 from ...solver.navigation.alignment import AttitudePrior
 from ...solver.navigation.carried import CameraMount
 from ...solver.navigation.error_state import NavigationSettings
-from ...solver.navigation.inertial_cleaning import Finding, clean_gnss, clean_inertial
+from ...solver.navigation.inertial_cleaning import Finding, clean_gnss, clean_inertial, in_order
 from ...solver.navigation.inertial_data import MEMS, GnssData, InertialData, InertialGrade
 from ..convert import LATEST_S
 from ..errors import UserError
@@ -40,7 +40,7 @@ _VELOCITY_SIGMA_M_S = 0.05  # where gnss.csv has velocities without sigmas
 
 @dataclass(frozen=True)
 class AttitudeTable:
-    """attitude.csv: (n,) times, (n, 3) roll, pitch, heading and sigmas, radians."""
+    """attitude.csv: (n,) times, which increase, (n, 3) roll, pitch, heading and sigmas, radians."""
 
     time_s: Array
     angles: Array
@@ -269,7 +269,10 @@ def _read_attitude(path: Path, notes: list[str]) -> AttitudeTable | None:
         sigma = table.stack(*SIGMA_ANGLES)
     else:
         notes.append(f"{path.name}: no sigmas ({','.join(SIGMA_ANGLES)}): 0.5, 0.5, 1 deg are assumed")
-    return AttitudeTable(_times(table), angles, np.radians(sigma))
+    time = _times(table)
+    rows, findings = in_order(time, "attitude.time", "attitudes")
+    notes.extend(f"{path.name}: time_s: {finding.text}" for finding in findings)
+    return AttitudeTable(time[rows], angles[rows], np.radians(sigma[rows]))
 
 
 def _initial_of(attitude: AttitudeTable, time_s: float) -> AttitudePrior | None:

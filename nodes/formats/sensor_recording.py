@@ -179,8 +179,5 @@ def _attitude(folder: SensorFolder, source: str) -> Iterator[Message]:
     if folder.attitude is None:
         return
     table = folder.attitude
-    newest = np.maximum.accumulate(table.time_s)
-    rising = np.concatenate([[True], table.time_s[1:] > newest[:-1]])
     for i, stamp in enumerate(_ns(table.time_s)):
-        if rising[i]:
-            yield Message("sensor/attitude", stamp, attitude_message(stamp, table.angles[i], table.sigma[i]), source)
+        yield Message("sensor/attitude", stamp, attitude_message(stamp, table.angles[i], table.sigma[i]), source)

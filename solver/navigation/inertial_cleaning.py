@@ -66,7 +66,7 @@ def clean_inertial(
         possible, more = _possible(t, a, b, np.flatnonzero(good), increments)
         findings += more
         t, a, b = t[possible], a[possible], b[possible]
-        rows, more = _in_order(t, "imu.time", "samples")
+        rows, more = in_order(t, "imu.time", "samples")
         findings += more
         t, a, b = t[rows], a[rows], b[rows]
         step = np.diff(t)
@@ -105,7 +105,7 @@ def _possible(
     return possible, findings
 
 
-def _in_order(time_s: Array, subject: str, name: str) -> tuple[NDArray[np.intp], list[Finding]]:
+def in_order(time_s: Array, subject: str, name: str) -> tuple[NDArray[np.intp], list[Finding]]:
     """Rows whose times (n,) increase, in that order, and what is to be said of it.
 
     Rows are kept in runs without a gap, which are put in the order of their beginnings: a file may have its parts in
@@ -155,7 +155,7 @@ def clean_gnss(gnss: GnssData) -> tuple[GnssData, list[Finding]]:
         text = f"{value:g}, wanted {'-90 to 90' if k == 0 else '-360 to 360'} deg: fix dropped{more}"
         findings.append(Finding("not geodetic", "gnss.position", text, False, (int(rows[i]), k)))
         gnss = gnss[np.flatnonzero(~off.any(axis=1))]
-    order, more = _in_order(gnss.time_s, "gnss.time", "fixes")
+    order, more = in_order(gnss.time_s, "gnss.time", "fixes")
     findings += more
     gnss = gnss[order]
     if len(gnss) and (np.abs(gnss.lat).max() > np.pi / 2 or np.abs(gnss.lon).max() > 2 * np.pi):

@@ -159,6 +159,22 @@ def test_initial_attitude_from_platform_and_from_attitude_csv(tmp_path, capsys):
     assert stretch["alignment"] == "given attitude" and stretch["innovations"]["heading"]["n"] > 90
 
 
+def test_one_attitude_with_a_wrong_time_is_told_and_costs_no_others(tmp_path, capsys):
+    folder = write(tmp_path / "flight")
+    t = np.arange(0.5, 99.0, 0.5)
+    times = t.copy()
+    times[20] = 1e6
+    table = np.column_stack([times, np.degrees(flight().motion.at(t).angles), np.full((len(t), 3), 0.2)])
+    header = "time_s,roll_deg,pitch_deg,heading_deg,sigma_roll_deg,sigma_pitch_deg,sigma_heading_deg"
+    np.savetxt(folder / "attitude.csv", table, "%.10g", ",", header=header, comments="")
+    read = read_sensor_folder(folder)
+    assert (read.attitude.time_s == np.sort(times)).all()
+    assert "attitude.csv: time_s: attitudes go back in time at 1 place(s): put in order" in read.notes
+    assert main(["navigate", str(folder), "-o", str(tmp_path / "out"), "--no-page", "--heading-aid", "--json"]) == 0
+    stretch = json.loads(capsys.readouterr().out)["stretches"][0]
+    assert stretch["innovations"]["heading"]["n"] > 90
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
