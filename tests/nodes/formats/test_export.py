@@ -422,7 +422,7 @@ def test_configuration_that_is_stated_again_counts(tmp_path):
     recording = Recording(path)
     assert recording.project().origin_latitude == 48.5 and recording.camera().name == other.name
     write_camera(tmp_path / "calibrated.json", other)  # which can stand for that one alone
-    assert process._camera(recording.reader, tmp_path / "calibrated.json")
+    assert process._camera(recording.reader, tmp_path / "calibrated.json", [])
     words = ["export", str(path), "--topic", "trajectory/smoothed", "--sbet", str(tmp_path / "o.sbet")]
     assert main(words) == 0
     assert np.degrees(np.fromfile(tmp_path / "o.sbet", "<f8")[1]) == pytest.approx(48.5, abs=1e-3)

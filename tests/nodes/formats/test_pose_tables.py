@@ -186,7 +186,8 @@ def test_sigmas_along_the_axes_of_a_crs_as_adjust_and_export_write_them(tmp_path
     messages = list(imported.messages)
     assert imported.notes == [
         "p.csv: 1 poses without sigmas: they get the accuracies of poses that have none "
-        "(--position-sigma, --attitude-sigma)"
+        "(--position-sigma, --attitude-sigma)",
+        "p.csv: poses are 1 s apart: more than 0.2 s between two are a gap without orientation for 'process'",
     ]
     poses = [pose_sample(message.body) for message in messages if message.topic == "trajectory/smoothed"]
 
