@@ -15,7 +15,7 @@ from ...solver.adjustment.job import BatchResult, Job
 from ...solver.adjustment.layout import CorrectionSet
 from ...solver.adjustment.network import Control, Network
 from ...solver.adjustment.reliability import HEAVY_TAILS, NARROWLY, Reliability, reliability
-from ...solver.adjustment.single_looks import SingleLooks, single_looks
+from ...solver.adjustment.single_looks import single_looks
 from ...solver.adjustment.snooping import control_tests
 from ...solver.adjustment.statistics import (
     PointAccuracy,
@@ -280,10 +280,11 @@ def accuracies(result: BatchResult) -> dict[str, Any]:
     tie[network.check.point] = tie[surveyed.point] = False
     reference = network.check if len(network.check) else surveyed
     direct = result.georeferenced
+    alone = single_looks(result.solution, result.cofactors, result.sigma0)
     return {
         "check": _accuracy(result.compare(network.check, points, sigma))
         | _expected(result, network.check, sigma, independent=True),
-        "check_single": _single_accuracy(single_looks(result.solution, result.cofactors, result.sigma0)),
+        "check_single": single_accuracy(alone.difference_m, alone.sigma_m, alone.expected_m),
         "control": _accuracy(result.compare(surveyed, points, sigma))
         | _expected(result, surveyed, sigma, independent=False),
         "tie": {"n": int(tie.sum()), "sigma_m": mean_sigma(sigma[tie]).tolist()},
@@ -312,12 +313,17 @@ def _expected(result: BatchResult, given: Control, sigma_m: Any, *, independent:
     return {"expected_m": np.where(n > 0, np.sqrt(mean), np.nan).tolist()}
 
 
-def _single_accuracy(alone: SingleLooks) -> dict[str, Any]:
-    """Accuracy of check points that their rays do not determine, at the given heights."""
-    if not len(alone.point):
+def single_accuracy(difference_m: Array, sigma_m: Array, expected_m: Array) -> dict[str, Any]:
+    """Accuracy of check points that their rays do not determine, at the given heights.
+
+    Parameters
+    ----------
+    difference_m, sigma_m, expected_m : (k, 2) as of `single_looks`, of flights or of scenes
+    """
+    if not len(difference_m):
         return {"n": 0}
-    expected = np.sqrt(np.mean(np.square(alone.expected_m), axis=0))
-    found = _accuracy(point_accuracy(with_height(alone.difference_m), with_height(alone.sigma_m)))
+    expected = np.sqrt(np.mean(np.square(expected_m), axis=0))
+    found = _accuracy(point_accuracy(with_height(difference_m), with_height(sigma_m)))
     return found | {"expected_m": [*expected.tolist(), np.nan]}
 
 

@@ -64,7 +64,7 @@ def _accuracy(c: Content) -> Iterator[str]:
         ("control", "control points"),
         ("direct_georeferencing", "direct georeferencing"),
     ):
-        a = c.get(key, {"n": 0})
+        a = c[key]
         if a["n"]:
             yield f"  {name:22s}{a['n']:5d} {_three(a['rmse_m'])} {_three(a['mean_m'])} {_three(a['sigma_m'])}"
             if _differ(a.get("expected_m"), a["sigma_m"]):

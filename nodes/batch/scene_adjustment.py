@@ -39,7 +39,15 @@ from ..errors import UserError
 from ..formats.satellite.rpc_files import write_rpb
 from ..formats.scene_block import ImageEntry, SceneBlockData
 from ..formats.table import write_table
-from .adjustment_result import HOPELESS, deserted_note, elsewhere, failing_note, reliability_summary, with_height
+from .adjustment_result import (
+    HOPELESS,
+    deserted_note,
+    elsewhere,
+    failing_note,
+    reliability_summary,
+    single_accuracy,
+    with_height,
+)
 from .json_values import plain
 from .two_steps import sigmas_stated, step_settings
 
@@ -420,9 +428,8 @@ def _single_accuracy(alone: SingleLooks) -> dict[str, Any]:
     """Accuracy of the rays of check points that nothing else determines, at the given heights."""
     if not len(alone.rays):
         return {"n": 0}
-    v, expected = alone.residual_px, np.sqrt(np.mean(np.square(alone.expected_m), axis=0))
-    return _accuracy(with_height(alone.difference_m), with_height(alone.sigma_m)) | {
-        "expected_m": [*expected.tolist(), np.nan],
+    v = alone.residual_px
+    return single_accuracy(alone.difference_m, alone.sigma_m, alone.expected_m) | {
         "rmse_px": np.sqrt(np.mean(np.square(v), axis=0)).tolist(),
         "mean_px": v.mean(axis=0).tolist(),
         "max_px": np.abs(v).max(axis=0).tolist(),

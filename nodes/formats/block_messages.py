@@ -14,6 +14,7 @@ from ...schemas.groups import grouped
 from ...schemas.topics import rank
 from ...solver.adjustment.block_data import BlockData
 from ...solver.adjustment.network import Strip
+from ...solver.geometry.measured_trajectory import POSE_GAP_S
 from ...solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion, quaternion_from_matrix
 from ...solver.geometry.trajectory import Trajectory
 from ...solver.models import WANDER_TIMES
@@ -23,8 +24,6 @@ from ..node import Message
 
 #: Time between strips whose times overlap in the files, after they are shifted, s.
 GAP_S = 10.0
-#: Poses farther apart, s, have a gap between them on line, in which there is no orientation.
-APART_S = 0.2
 #: Poses that are put in between are so far apart, s; over longer steps than a minute there are none.
 FILLED_S, LONGEST_FILLED_S = 0.1, 60.0
 #: Strips that a note names.
@@ -246,7 +245,7 @@ def filled(trajectory: Trajectory) -> Trajectory:
     time_s = trajectory.time_s
     step = np.diff(time_s)
     longest = min(largest_step_ns(np.rint(time_s * SECOND_NS).astype(np.int64)) / SECOND_NS, LONGEST_FILLED_S)
-    thin = (step > APART_S) & (step <= longest)
+    thin = (step > POSE_GAP_S) & (step <= longest)
     if not thin.any():
         return trajectory
     number = np.where(thin, np.ceil(step / FILLED_S - 1e-6), 1.0).astype(np.int64)

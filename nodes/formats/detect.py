@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...solver.camera.line_camera import LineCamera
+from ...solver.geometry.measured_trajectory import POSE_GAP_S
 from ...solver.navigation.inertial_data import InertialGrade
 from ..convert import SECOND_NS, camera_message, state_noise
 from ..errors import UserError
@@ -19,7 +20,7 @@ from .avirisc import LINE_RATE_HZ, is_avirisc, read_avirisc
 from .avirisng import is_avirisng, read_avirisng
 from .block_folder import is_block_folder, read_block
 from .block_images import with_block_images
-from .block_messages import APART_S, block_messages, not_carried
+from .block_messages import block_messages, not_carried
 from .envi_image import is_envi_image
 from .geocal_xml import kind_of, read_tie_points
 from .gps_time import GPS_EPOCH_S, WEEK_S
@@ -244,8 +245,8 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
         if not track.has_accuracies:
             notes.extend(_assumed(path, options.accuracy))
         usual_s = float(np.median(np.diff(track.time_ns))) * 1e-9
-        if usual_s > APART_S:
-            what = f"more than {APART_S:g} s between two are a gap without orientation for 'process'"
+        if usual_s > POSE_GAP_S:
+            what = f"more than {POSE_GAP_S:g} s between two are a gap without orientation for 'process'"
             notes.append(f"{path.name}: poses are {usual_s:.3g} s apart: {what}")
         strip = None
         if options.lines is not None:  # the images are the strip, not the poses

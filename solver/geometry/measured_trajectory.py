@@ -12,6 +12,9 @@ from .trajectory import Poses, Trajectory, noise_between, sample_before, slopes
 
 Array = NDArray[np.floating]
 
+#: Poses farther apart, s, have a gap between them on line, in which there is no orientation. Tuned: poses that come
+#: less often do not tell how the platform moves in turbulence.
+POSE_GAP_S = 0.2
 #: Smoothed poses are waited for so long, s, after the time they belong to: longer than a smoother lags behind, and than
 #: a filter that has aligned itself in motion reaches back to its first data. Tuned: a shorter one makes orientation
 #: final on filtered poses, a longer one only delays what a gap in the data has spoilt anyway.
@@ -162,7 +165,7 @@ class MeasuredTrajectory:
     noise_time_s : lag at which the noise of smoothed positions is correlated by 1/e, as stated last; 0 = white
     """
 
-    def __init__(self, gap_s: float = 0.2):
+    def __init__(self, gap_s: float = POSE_GAP_S):
         self.gap_s = gap_s
         self._filtered, self._smoothed = GrowingTrajectory(), GrowingTrajectory()
         self.noise_time_s = 0.0
