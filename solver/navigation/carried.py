@@ -328,11 +328,10 @@ def passed_over(
 
 
 def gravitation(r_e: Array) -> Array:
-    """Gravitation (m, 3) at Earth-fixed positions (m, 3)."""
+    """Gravitation (m, 3), m/s^2, at Earth-fixed positions (m, 3), m."""
     g = earth.geodetic_from_ecef(r_e)
-    down = earth.R_en(g[:, 0], g[:, 1])[:, :, 2]
     w2 = earth.ROTATION_RATE**2 * np.array([1.0, 1.0, 0.0])
-    return down * earth.normal_gravity(g[:, 0], g[:, 2])[:, None] - w2 * r_e
+    return np.einsum("mij,mj->mi", earth.R_en(g[:, 0], g[:, 1]), earth.gravity_n(g[:, 0], g[:, 2])) - w2 * r_e
 
 
 def navigation_jacobian(states: NavigationStates) -> Array:

@@ -47,9 +47,9 @@ _M = _WIE2 * earth.SEMI_MAJOR_M**3 * (1.0 - earth.FLATTENING) / earth.GM
 
 
 def gravitation_e(position_e: Array) -> Array:
-    """Gravitation (3,) at an Earth-fixed position (3,): Somigliana's normal gravity less the centrifugal acceleration.
+    """Gravitation (3,), m/s^2, at an Earth-fixed position (3,), m: normal gravity less the centrifugal acceleration.
 
-    Scalar arithmetic, because it is called twice a block; the same as `earth.normal_gravity` along the normal.
+    Scalar arithmetic, because it is called twice a block; the same as `earth.gravity_n`.
     """
     x, y, z = position_e.tolist()
     p = math.hypot(x, y)
@@ -66,8 +66,9 @@ def gravitation_e(position_e: Array) -> Array:
     h = (p * c + z * s - a / w * (1.0 - e2 * s2)) / a
     g = earth.GRAVITY_EQUATOR * (1.0 + earth.SOMIGLIANA_K * s2) / w
     g *= 1.0 - 2.0 * (1.0 + f + _M - 2.0 * f * s2) * h + 3.0 * h * h
-    k = g * c / p if p > 0.0 else 0.0
-    return np.array([-(k + _WIE2) * x, -(k + _WIE2) * y, -g * s])
+    north = -2.0 * earth.GRAVITY_LEAN * earth.SEMI_MAJOR_M * h * s * c
+    k = (g * c + north * s) / p if p > 0.0 else 0.0
+    return np.array([-(k + _WIE2) * x, -(k + _WIE2) * y, north * c - g * s])
 
 
 @dataclass(slots=True)

@@ -111,7 +111,7 @@ class TrueMotion:
         omega = np.array([0.0, 0.0, earth.ROTATION_RATE])
         r = self._r(t) + self._origin
         g = earth.geodetic_from_ecef(r)
-        gravity = earth.R_en(g[..., 0], g[..., 1])[..., :, 2] * earth.normal_gravity(g[..., 0], g[..., 2])[..., None]
+        gravity = np.einsum("...ij,...j->...i", earth.R_en(g[..., 0], g[..., 1]), earth.gravity_n(g[..., 0], g[..., 2]))
         force = self._a(t) + 2.0 * np.cross(omega, self._v(t)) - gravity
         return rate + R_be @ omega, (R_be @ force[..., None])[..., 0]
 

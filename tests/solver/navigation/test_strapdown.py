@@ -53,7 +53,7 @@ def local_level(true, start_s, end_s):
         w_en = np.array([v[1] / (R_E + h), -v[0] / (R_N + h), -v[1] * np.tan(lat) / (R_E + h)])
         rate, force = (x[0] for x in true.felt(np.array([t])))
         R_nb = matrix_from_quaternion(q)
-        g = np.array([0.0, 0.0, float(earth.normal_gravity(lat, h))])
+        g = np.array([-8.14e-9 * h * np.sin(2 * lat), 0.0, float(earth.normal_gravity(lat, h))])
         dv = R_nb @ force - np.cross(2 * w_ie + w_en, v) + g
         dq = 0.5 * quaternion_multiply(q, np.array([*(rate - R_nb.T @ (w_ie + w_en)), 0.0]))
         return np.array([v[0] / (R_N + h), v[1] / ((R_E + h) * np.cos(lat)), -v[2], *dv, *dq])
