@@ -337,6 +337,13 @@ def joining_notes(joined: JoinedBlock, names: Sequence[str]) -> list[str]:
         notes.append("no point was measured in more than one recording: they are adjusted side by side")
     if joined.elsewhere:
         notes.append(f"{joined.elsewhere} tie points have a name that comes again at another place, and are kept apart")
+    if joined.restated:
+        of = ", ".join(f"{point} (those of {name} count)" for point, name in joined.restated[:RENAMED_SHOWN])
+        more = len(joined.restated) - RENAMED_SHOWN
+        notes.append(
+            f"known points with sigmas that are not the same in all recordings: {of}"
+            + (f", and {more} more" if more > 0 else "")
+        )
     if joined.renamed:
         shown = ", ".join(f"{id} of {name} is {new}" for name, id, new in joined.renamed[:RENAMED_SHOWN])
         more = len(joined.renamed) - RENAMED_SHOWN

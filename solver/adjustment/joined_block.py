@@ -24,7 +24,7 @@ from .network import Strip
 #: Tie points of one name farther apart than this share of the height above ground are different points. Measured
 #: orientation errs by less, and a single look says no more; a name that comes again by chance lies anywhere.
 APART = 0.05
-#: Known coordinates of one name differ by less than this, m, or somebody is wrong.
+#: Known coordinates of one name differ by less than this, m, or somebody is wrong; so do their sigmas, or it is told.
 SAME_M = 1e-3
 
 
@@ -40,6 +40,8 @@ class JoinedBlock:
     ground, ties : known points, and tie points, that more than one recording has looks at
     renamed : strips of which there were several, as (recording, name, name in the block)
     elsewhere : tie points whose name comes again at another place, and were kept apart
+    restated : known points of which a later recording states other sigmas, as (point, recording that counts); the first
+        that has the point counts
     """
 
     block: BlockData
@@ -50,6 +52,7 @@ class JoinedBlock:
     ties: int
     renamed: tuple[tuple[str, str, str], ...]
     elsewhere: int
+    restated: tuple[tuple[str, str], ...] = ()
 
 
 def join_blocks(blocks: Sequence[BlockData], names: Sequence[str]) -> JoinedBlock:
@@ -71,7 +74,7 @@ def join_blocks(blocks: Sequence[BlockData], names: Sequence[str]) -> JoinedBloc
         if block.heading != first.heading:
             raise ValueError(f"the attitude of {name} is of another kind than that of {names[0]}")
     blocks = [first, *(_in_frame(block, first) for block in blocks[1:])]
-    ground, known = _known_points(blocks, names)
+    ground, known, restated = _known_points(blocks, names)
     strips, recording, renamed = _strips(blocks, names)
     point_ids, places, elsewhere = _point_names(blocks, names, known)
     first_strip = np.cumsum([0, *(len(b.strips) for b in blocks)])
@@ -101,6 +104,7 @@ def join_blocks(blocks: Sequence[BlockData], names: Sequence[str]) -> JoinedBloc
         int(common.sum()) - of_ground,
         renamed,
         elsewhere,
+        restated,
     )
 
 
@@ -169,12 +173,17 @@ def _moved(strip: Strip, shift_s: float, turn: Array | None, offset: Array) -> S
     )
 
 
-def _known_points(blocks: Sequence[BlockData], names: Sequence[str]) -> tuple[KnownPoints, dict[str, int]]:
-    """Known points of all blocks, each once, and their places; without those that an operator refused in one of them,
-    since the others state the same coordinates."""
+def _known_points(
+    blocks: Sequence[BlockData], names: Sequence[str]
+) -> tuple[KnownPoints, dict[str, int], tuple[tuple[str, str], ...]]:
+    """Known points of all blocks, each once; their places; those with sigmas that differ, and whose count.
+
+    Without those that an operator refused in one of the blocks, since the others state the same coordinates.
+    """
     refused = frozenset[str]().union(*(block.refused for block in blocks))
     place: dict[str, int] = {}
     rows: list[tuple[int, int]] = []
+    restated: dict[str, str] = {}
     for i, block in enumerate(blocks):
         for k, id in enumerate(block.ground.id):
             if id in refused:
@@ -190,6 +199,11 @@ def _known_points(blocks: Sequence[BlockData], names: Sequence[str]) -> tuple[Kn
                     f"known point {id}: {names[i]} and {names[j]} do not say the same "
                     f"({block.ground.role[k]} and {blocks[j].ground.role[m]}, {apart:.3f} m apart)"
                 )
+            sigma_m, counts_m = (
+                np.sqrt(np.diagonal(b.ground.covariance[of])) for b, of in ((block, k), (blocks[j], m))
+            )
+            if np.abs(sigma_m - counts_m).max() > SAME_M:
+                restated[id] = names[j]
     radius = tuple(
         blocks[i].ground.target_radius_m[k] if blocks[i].ground.target_radius_m else 0.0 for i, k in rows
     )  # fmt: skip
@@ -200,7 +214,7 @@ def _known_points(blocks: Sequence[BlockData], names: Sequence[str]) -> tuple[Kn
         tuple(blocks[i].ground.role[k] for i, k in rows),
         radius if any(block.ground.target_radius_m for block in blocks) else (),
     )
-    return ground, place
+    return ground, place, tuple(restated.items())
 
 
 def _strips(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from adjustment_networks import CAMERA
 
+from triline.nodes.cli.adjust import joining_notes
 from triline.solver.adjustment.adjustment import adjust
 from triline.solver.adjustment.block_data import BlockData, ImagePoints, KnownPoints, network_from_block
 from triline.solver.adjustment.covariance import cofactors
@@ -129,6 +130,22 @@ def test_another_frame_is_turned_into_the_first(block):
         np.testing.assert_allclose(ours.trajectory.position_l, theirs.trajectory.position_l, atol=1e-6)
         turned = matrix_from_quaternion(ours.trajectory.quaternion)
         np.testing.assert_allclose(turned, matrix_from_quaternion(theirs.trajectory.quaternion), atol=1e-12)
+
+
+def test_control_with_other_sigmas_is_told(block):
+    """The first recording that has the point counts, and nothing said so."""
+    first, second = some_strips(block, [0, 1]), some_strips(block, [2, 3])
+    covariance = second.ground.covariance.copy()
+    covariance[1] *= 25.0
+    other = replace(second, ground=replace(second.ground, covariance=covariance))
+    assert join_blocks([first, second], ["day1", "day2"]).restated == ()
+    joined = join_blocks([first, other], ["day1", "day2"])
+    point = second.ground.id[1]
+    assert joined.restated == ((point, "day1"),)
+    kept = joined.block.ground.covariance[joined.block.ground.id.index(point)]
+    np.testing.assert_array_equal(kept, first.ground.covariance[first.ground.id.index(point)])
+    (note,) = [note for note in joining_notes(joined, ["day1", "day2"]) if "sigmas that are not the same" in note]
+    assert note.endswith(f"in all recordings: {point} (those of day1 count)")
 
 
 def test_what_contradicts_is_refused(block):
