@@ -21,11 +21,6 @@ _LEAPS = (
 _LEAP_S = np.array([int(datetime.fromisoformat(day).replace(tzinfo=UTC).timestamp()) for day in _LEAPS.split()])
 
 
-def leap_seconds(utc_s: float) -> int:
-    """GPS minus UTC, seconds, at a time in seconds since the Unix epoch."""
-    return int(np.searchsorted(_LEAP_S, utc_s, side="right"))
-
-
 def gps_week(day: date) -> tuple[int, int]:
     """GPS week of a day, and the day of the week (0 = Sunday)."""
     days = (day - date(1980, 1, 6)).days

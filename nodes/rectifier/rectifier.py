@@ -29,8 +29,6 @@ LIVE_PATIENCE_S = 1.0
 LEAST_POINTS, RELIEF_S, MOST_POINTS = 12, 4.0, 3000
 #: Lines of a strip that nobody has announced wait so long for it, ns: the matcher announces what it finds 0.8 s later.
 UNKNOWN_NS = 2_000_000_000
-#: The ground is at most so far below the camera as a share of the guess from the project, to be believed.
-VERSIONS = ("live", "final")
 
 
 class Rectifier(Node):

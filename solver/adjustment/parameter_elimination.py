@@ -188,11 +188,6 @@ class Reduced:
         return np.minimum(pivot, 1.0)
 
 
-def gather_evidence(solution: Solution) -> Evidence:
-    """What a solution says about its additional parameters."""
-    return Reduced.of(solution).evidence
-
-
 def eliminate(
     solution: Solution,
     limits: Limits = Limits(),  # noqa: B008  (frozen)

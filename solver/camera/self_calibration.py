@@ -216,12 +216,6 @@ class SelfCalibration:
         columns = np.append(unknown, -1)[self.columns].astype(np.int32)
         return CameraDesign(pattern, columns, self.slots, xy_mm.T, focal_length_mm)
 
-    def expand(self, values: Array, fill: float = 0.0) -> Array:
-        """Values of the estimated parameters (n_unknowns,) put in their places among all (m,)."""
-        full = np.full(len(self.names), fill)
-        full[self.estimated] = values
-        return full
-
     def _place(self, name: str) -> int:
         if name not in self.names:
             raise ValueError(f"no additional parameter {name!r} in {self.name}: {' '.join(self.names)}")

@@ -114,7 +114,6 @@ class NavigationTrajectory:
         first unused
     P_start, P_end : (N, n, n)
     carried : inertial integrals
-    gain : (N - 1, n, n) smoother gains, for covariances between times
     """
 
     def __init__(
@@ -124,11 +123,10 @@ class NavigationTrajectory:
         P_start: Array,
         P_end: Array,
         carried: Carried,
-        gain: Array | None = None,
     ):
         self.nodes, self._end = start, end
         self.P, self._P_end = P_start, P_end
-        self._carried, self._gain = carried, gain
+        self._carried = carried
         self._q = np.concatenate([[[0.0, 0.0, 0.0, 1.0]], carried.quaternion])
         self._vp = np.concatenate([np.zeros((1, 7)), np.column_stack([carried.duration_s, carried.v, carried.p])])
         last = np.searchsorted(
@@ -153,7 +151,7 @@ class NavigationTrajectory:
     @classmethod
     def smoothed(cls, forward: FilterPass, s: Smoothed) -> NavigationTrajectory:
         """Trajectory after smoothing."""
-        return cls(s.estimates, s.estimates, s.P, s.P, forward.carried, s.gain)
+        return cls(s.estimates, s.estimates, s.P, s.P, forward.carried)
 
     @property
     def start_s(self) -> float:
@@ -225,37 +223,6 @@ class NavigationTrajectory:
         """Poses of a camera at times (m,), with covariance."""
         states = self.at(time_s)
         return camera_poses(states, self.covariance(states.time_s), frame, mount or CameraMount())
-
-    def camera_covariance(self, time_s: ArrayLike, frame: LocalFrame, mount: CameraMount | None = None) -> Array:
-        """Joint covariance (6m, 6m) of camera poses at m increasing times, with their correlation in time.
-
-        The correlation is that of the nodes nearest to the times; it needs a smoothed trajectory.
-
-        Raises
-        ------
-        ValueError : the trajectory is not smoothed
-        """
-        if self._gain is None:
-            raise ValueError("covariances between times need a smoothed trajectory")
-        states = self.at(time_s)
-        J = camera_jacobian(states, frame, mount or CameraMount())
-        node = np.abs(np.searchsorted(self.nodes.time_s, states.time_s))
-        k, s = self._share(states.time_s)
-        node = k + (s > 0.5)
-        m = len(node)
-        P = self.covariance(states.time_s)
-        out = np.zeros((m, 6, m, 6))
-        for j in range(m):
-            out[j, :, j] = J[j] @ P[j] @ J[j].T
-            chain = self.P[node[j]]
-            last = node[j]
-            for i in range(j - 1, -1, -1):
-                for g in range(last - 1, node[i] - 1, -1):
-                    chain = self._gain[g] @ chain
-                last = min(last, node[i])
-                out[i, :, j] = J[i] @ chain[:9, :9] @ J[j].T
-                out[j, :, i] = out[i, :, j].T
-        return out.reshape(6 * m, 6 * m)
 
     def _inside(self, time_s: ArrayLike) -> Array:
         t = np.atleast_1d(np.asarray(time_s, dtype=float))

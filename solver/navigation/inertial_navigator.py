@@ -60,7 +60,6 @@ class InertialNavigator:
         self._watch_gnss = GnssWatch()
         self._events: list[NavigationEvent] = []
         self._last_s = -np.inf  # stamp of the last inertial sample
-        self._interval = 0.0
         self._previous: tuple[Vector, Vector, float] | None = None  # sample before the open ones
         self._published = -np.inf
         self._published_smooth = -np.inf

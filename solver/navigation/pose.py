@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections import Counter
 from dataclasses import dataclass
 from math import asin, atan2, cos, sin
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,25 +58,6 @@ class NavigationEvent:
 
     time_s: float
     text: str
-
-
-class NavigationEngine(Protocol):
-    """What turns sensor data into poses: filtered ones at once, smoothed ones after a lag.
-
-    Attributes
-    ----------
-    counters : what was wrong with the data, by kind
-    """
-
-    counters: Counter[str]
-
-    def add_attitude(self, time_s: float, rpy: ArrayLike, covariance: ArrayLike) -> list[NavigationPose]: ...
-
-    def add_gnss(self, time_s: float, antenna_l: ArrayLike, covariance: ArrayLike) -> list[NavigationPose]: ...
-
-    def finish(self) -> list[NavigationPose]: ...
-
-    def take_events(self) -> list[NavigationEvent]: ...
 
 
 class AttitudeHistory:

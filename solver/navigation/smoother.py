@@ -28,12 +28,10 @@ class Smoothed:
     ----------
     estimates : (N)
     P : (N, n, n)
-    gain : (N - 1, n, n); the cross-covariance of nodes k and k + 1 is ``gain[k] @ P[k + 1]``
     """
 
     estimates: Estimates
     P: Array
-    gain: Array
 
 
 def gains(F: Array, P_posterior: Array, P_prior: Array) -> Array:
@@ -93,4 +91,4 @@ def smooth(forward: FilterPass) -> Smoothed:
     """Smooth a filter pass over its whole length."""
     G = gains(forward.F, forward.P_posterior, forward.P_prior)
     d, P = recurse(G, forward.P_posterior, forward.P_prior, forward.x)
-    return Smoothed(corrected(forward.posterior, d, forward.settings.layout), P, G)
+    return Smoothed(corrected(forward.posterior, d, forward.settings.layout), P)

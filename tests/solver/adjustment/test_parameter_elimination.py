@@ -6,7 +6,7 @@ from adjustment_networks import CAMERA, simulate
 
 from triline.solver.adjustment.adjustment import AdjustmentOptions, pose_problem, solve
 from triline.solver.adjustment.determinability import Limits, examine
-from triline.solver.adjustment.parameter_elimination import Reduced, eliminate, gather_evidence
+from triline.solver.adjustment.parameter_elimination import Reduced, eliminate
 from triline.solver.camera.self_calibration import tls
 from triline.solver.models.dgr import DgrOptions
 from triline.solver.models.slow_errors import SlowErrors
@@ -28,7 +28,7 @@ def full():
 def anew(full, gone):
     """The evidence of the network adjusted without parameters, places and weights of rays taken where they are then."""
     found = solve(pose_problem(full.network, MODEL, PARAMETERS.without(gone)))
-    return gather_evidence(solve(found.problem, found.state))
+    return Reduced.of(solve(found.problem, found.state)).evidence
 
 
 def test_what_is_left_is_what_an_adjustment_without_the_parameters_says(full):
@@ -52,7 +52,7 @@ def test_what_is_left_is_what_an_adjustment_without_the_parameters_says(full):
 def test_the_parameters_that_go_are_those_that_adjustments_after_each_would_name(full):
     outcome = eliminate(full)
     gone = []
-    while (verdict := examine(anew(full, gone) if gone else gather_evidence(full))).removal is not None:
+    while (verdict := examine(anew(full, gone) if gone else Reduced.of(full).evidence)).removal is not None:
         gone.append(verdict.removal.name)
     assert [r.name for r in outcome.removed] == gone and len(gone) > 6
     assert outcome.kept.keys() == verdict.kept.keys()
@@ -68,7 +68,7 @@ def test_the_parameters_that_go_are_those_that_adjustments_after_each_would_name
 
 def test_what_only_the_pivot_tells_apart_or_lies_far_from_zero_is_adjusted_anew(full):
     known = Reduced.of(full)
-    t = np.abs(known.theta[known.solution.layout.n_model :]) / np.sqrt(np.diag(gather_evidence(full).cofactors))
+    t = np.abs(known.theta[known.solution.layout.n_model :]) / np.sqrt(np.diag(Reduced.of(full).evidence.cofactors))
     near, far = known.names[int(np.argmin(t))], known.names[int(np.argmax(t))]
     assert t.max() > 10.0 and known.without(near) is not None and known.without(far) is None
 

@@ -315,23 +315,6 @@ def test_roll_pitch_heading_derivatives(tactical):
     assert np.allclose(J[:3, :3], R_ne[0])
 
 
-def test_correlation_in_time_of_a_smoothed_trajectory(tactical):
-    _, r = tactical[0]
-    frame = LocalFrame(47.5, 9.2, 0.0)
-    t = np.array([300.0, 300.5, 305.0, 340.0])
-    joint = r.smoothed.camera_covariance(t, frame)
-    single = r.smoothed.camera(t, frame).covariance
-    for i in range(4):
-        assert np.allclose(joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6], single[i], rtol=1e-6, atol=1e-14)
-    d = np.sqrt(np.diag(joint))
-    correlation = joint / np.outer(d, d)
-    assert np.linalg.eigvalsh(correlation).min() > -0.05
-    height = correlation[2, [8, 14, 20]]
-    assert height[0] > 0.9 and height[0] > height[1] > abs(height[2])
-    with pytest.raises(ValueError, match="smoothed"):
-        r.filtered.camera_covariance(t, frame)
-
-
 def test_held_out_fixes_are_predicted():
     f = sim.flight(duration_s=200.0, seed=12)
     out = np.arange(len(f.gnss)) % 5 == 4
