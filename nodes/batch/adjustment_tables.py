@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...schemas.units import place_columns
-from ...solver.adjustment.adjustment import Solution
 from ...solver.adjustment.layout import CorrectionSet
-from ...solver.adjustment.refined_orientation import design_at
+from ...solver.adjustment.refined_orientation import correction_cofactors, corrections_at
 from ...solver.adjustment.reliability import reliability
 from ...solver.geometry.rotation import corrected_angles, matrix_from_angles
 from ..formats.line_orientation import OrientedLines, poses_in_crs
@@ -162,23 +161,6 @@ def correction_functions(adjustment: Adjustment, item: CorrectionSet, time_s: Ar
 
     The covariance is that of the last stage, which estimates what the stages before it left.
     """
-    result = adjustment.result
-    total = np.zeros((len(time_s), 6))
-    for stage in result.stages:
-        mine = next(s for s in stage.layout.sets if (s.strip, s.lens) == (item.strip, item.lens))
-        total += design_at(stage, mine, time_s).evaluate(stage.state.theta)
-    return total, result.sigma0**2 * correction_cofactors(result.solution, item, time_s)
-
-
-def correction_cofactors(solution: Solution, item: CorrectionSet, time_s: Array) -> Array:
-    """Covariance (n, 6, 6) of the correction functions of a set for sigma0 = 1, from the cofactors of its unknowns."""
-    design = design_at(solution, item, time_s)
-    numbers = design.unknowns()
-    Q = np.pad(solution.factor.cofactors(numbers), ((0, 1), (0, 1)))  # the last column reads zeros
-    columns = np.where(design.columns >= 0, np.searchsorted(numbers, design.columns), -1)
-    found = np.zeros((len(time_s), 6, 6))
-    for a in range(design.columns.shape[1]):
-        for b in range(design.columns.shape[1]):
-            weight = design.coefficients[:, a] * design.coefficients[:, b]
-            found += weight[:, None, None] * Q[columns[:, a, :, None], columns[:, b, None, :]]
-    return found
+    solution = adjustment.result.solution
+    which = solution, item.strip, time_s, item.lens
+    return corrections_at(*which), adjustment.result.sigma0**2 * correction_cofactors(*which)

@@ -10,6 +10,10 @@ from ..models.base import Design
 from .adjustment import Solution
 from .layout import CorrectionSet, platform_design
 
+#: Times whose cofactors are computed at once; their linear functions take several times the room of what comes out.
+#: Tuned, for memory.
+AT_ONCE = 10_000
+
 
 def corrections_at(solution: Solution, strip: int, time_s: ArrayLike, lens: int | None = None) -> Array:
     """Corrections (n, 6) to the measured orientation of a strip at times (n,), metres and radians.
@@ -41,8 +45,9 @@ def correction_cofactors(solution: Solution, strip: int, time_s: ArrayLike, lens
     _, group = np.unique(columns.reshape(len(columns), -1), axis=0, return_inverse=True)
     for g in range(int(group.max(initial=-1)) + 1):
         mine = np.flatnonzero(group == g)
-        numbers, A = Design(columns[mine], coefficients[mine]).functions()
-        result[mine] = (A @ solution.factor.cofactors(numbers)) @ np.swapaxes(A, 1, 2)
+        for some in np.array_split(mine, 1 + len(mine) // AT_ONCE):
+            numbers, A = Design(columns[some], coefficients[some]).functions()
+            result[some] = (A @ solution.factor.cofactors(numbers)) @ np.swapaxes(A, 1, 2)
     return result
 
 
