@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,6 +47,46 @@ class Rays:
 
     origin_e: Array
     direction_e: Array
+
+
+class Miss(NamedTuple):
+    """How far directions in the body pass beside what n detectors look along, and how that changes by the line.
+
+    Attributes
+    ----------
+    across, along : (n, 3) axes across the line of detectors and along it, at right angles to the look directions
+    square : (n,) squared length of these
+    depth : (n,) components along the look directions, times their length; above 0 in front of the sensor
+    f, g : (n,) components along ``across`` and ``along``, over the depth
+    f_rate, g_rate : (n,) their change, a line
+    """
+
+    across: Array
+    along: Array
+    square: Array
+    depth: Array
+    f: Array
+    g: Array
+    f_rate: Array
+    g_rate: Array
+
+
+def miss_of(d: Array, rate: Array, look: Array, slope: Array) -> Miss:
+    """`Miss` of directions (n, 3) in the body.
+
+    Parameters
+    ----------
+    d, rate : (n, 3) directions and their change, a line
+    look, slope : (n, 3) look directions of the detectors and their change, a sample
+    """
+    across = np.cross(look, slope)
+    square = _dot(look, look)
+    along = slope - look * (_dot(look, slope) / square)[:, None]
+    depth, depth_rate = _dot(d, look), _dot(rate, look)
+    f, g = _dot(d, across) / depth, _dot(d, along) / depth
+    f_rate = (_dot(rate, across) - f * depth_rate) / depth
+    g_rate = (_dot(rate, along) - g * depth_rate) / depth
+    return Miss(across, along, square, depth, f, g, f_rate, g_rate)
 
 
 class PushbroomSensor:
@@ -291,21 +332,15 @@ class PushbroomSensor:
                 rates[active] = (self._towards(straight[active], u[active] + step)[0] - d) / step[:, None]
             rate = rates[active]
             look, slope = self.look.at(v[active])
-            across = np.cross(look, slope)
-            square = _dot(look, look)
-            along = slope - look * (_dot(look, slope) / square)[:, None]
-            depth, depth_rate = _dot(d, look), _dot(rate, look)
-            f, g = _dot(d, across) / depth, _dot(d, along) / depth
-            f_rate = (_dot(rate, across) - f * depth_rate) / depth
-            g_rate = (_dot(rate, along) - g * depth_rate) / depth
+            at = miss_of(d, rate, look, slope)
             with np.errstate(divide="ignore", invalid="ignore"):
-                du = -f / f_rate
+                du = -at.f / at.f_rate
             new_u = np.clip(np.where(np.isfinite(du), u[active] + du, u[active]), u_low, u_high)
             du = new_u - u[active]
-            dv = (g + g_rate * du) * square / _dot(along, along)
+            dv = (at.g + at.g_rate * du) * at.square / _dot(at.along, at.along)
             new_v = np.clip(v[active] + dv, low, high)
             moved[active] = np.maximum(np.abs(du), np.abs(new_v - v[active]))
-            seen[active] = (depth > 0) & (np.abs(f) <= _HELD_LINES * np.abs(f_rate))  # not held at an end
+            seen[active] = (at.depth > 0) & (np.abs(at.f) <= _HELD_LINES * np.abs(at.f_rate))  # not held at an end
             u[active], v[active] = new_u, new_v
             active = active[moved[active] > _CONVERGED_PX]
             if not len(active):

@@ -22,7 +22,7 @@ from ..camera.line_camera import CcdLine, Lens, LineCamera
 from ..camera.self_calibration import SelfCalibration
 from ..geometry.rotation import R_BC_NOMINAL
 from ..location.look_directions import LookDirections
-from ..location.pushbroom import SPEED_OF_LIGHT, PushbroomSensor
+from ..location.pushbroom import SPEED_OF_LIGHT, PushbroomSensor, miss_of
 from ..models.base import CorrectionModel, direct_observations
 from ..orbit.motion import FixedPoses, Motion, R_from_orbital
 from .images import CAMERA, ORIENTATION, Equations, UnknownGroup
@@ -275,13 +275,7 @@ class _Lines:
             look, slope = look - self._effect @ ap, slope - self._effect_slope @ ap
         d = sensor.appearance(position_e, pose)
         rate = (sensor.appearance(position_e, later) - d) / self._step[:, None]
-        across = np.cross(look, slope)
-        square = _dot(look, look)
-        along = slope - look * (_dot(look, slope) / square)[:, None]
-        depth, depth_rate = _dot(d, look), _dot(rate, look)
-        f, g = _dot(d, across) / depth, _dot(d, along) / depth
-        f_rate = (_dot(rate, across) - f * depth_rate) / depth
-        g_rate = (_dot(rate, along) - g * depth_rate) / depth
+        across, along, square, depth, f, g, f_rate, g_rate = miss_of(d, rate, look, slope)
         along_px = square / _dot(along, along)
         du = -f / f_rate
         computed = self._pixel + np.stack([du, (g + g_rate * du) * along_px], axis=1)
