@@ -140,6 +140,7 @@ def test_a_restart_in_flight_catches_up(sensors):
         o.body.timestamp.ToNanoseconds(): o.body for o in run(Navigator(), sensors) if o.topic == "trajectory/smoothed"
     }
     late = [o.body for o in out if o.topic == "trajectory/smoothed"][-100:]
+    assert len(late) == 100
     for body in late:
         other = whole[body.timestamp.ToNanoseconds()]
         assert body.pose.position.x == pytest.approx(other.pose.position.x, abs=0.05)

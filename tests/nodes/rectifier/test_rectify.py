@@ -182,7 +182,7 @@ def test_orientation_of_an_adjustment_goes_with_the_camera_that_it_calibrated(fl
     _rectify(capsys, flown, folder / "off.tif", "--trajectory", out / "trajectory_refined.csv", *options)
     with rasterio.open(folder / "off.tif") as image:
         apart = np.hypot(image.transform.c - whole[name][1].c, image.transform.f - whole[name][1].f)
-        assert apart > 30 or not np.array_equal(image.read(1), whole["trajectory_refined.csv"][0])
+        assert apart > 30
     (out / "camera.json").write_text((out / "camera.json").read_text().replace('"id": "N"', '"id": "M"'))
     assert (
         main(["rectify", str(flown), "-o", str(folder / "x.tif"), "--trajectory", str(out / "orientation_lines.csv")])

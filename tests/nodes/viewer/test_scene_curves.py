@@ -88,7 +88,9 @@ def test_curves_are_not_drawn_across_a_turn(notes):
 
 def test_deviations_are_not_joined_from_strip_to_strip(notes):
     for entity in ("flight/live", "flight/final", "flight/truth"):
-        for strips in notes.pieces(entity):
+        pieces = notes.pieces(entity)
+        assert len(pieces) > 0, entity
+        for strips in pieces:
             steps = np.linalg.norm(np.diff(strips[0], axis=0), axis=1)
             assert steps.max() < 200.0, entity  # 14 m between samples, and exaggerated errors
 
