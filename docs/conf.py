@@ -22,7 +22,7 @@ napoleon_google_docstring = False
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 default_role = "literal"
-exclude_patterns = ["recordings.ipynb", "images/README.md"]
+exclude_patterns = ["recordings.ipynb"]
 # links to files of the repository, and anchors that only the source page has
 suppress_warnings = ["myst.xref_missing", "ref.python", "docutils", "autodoc", "myst.header"]
 html_theme = "pydata_sphinx_theme"
@@ -31,8 +31,8 @@ html_theme_options = {"show_prev_next": False, "navigation_with_keys": False, "s
 html_show_sourcelink = False
 html_copy_source = False
 #: Rooms of the mathematics, as the reference lists them.
-ROOMS = ("geometry", "orbit", "location", "sensitivity", "estimation", "camera", "models", "adjustment", "window")
-ROOMS += ("navigation", "matching", "orthoimage", "simulation")
+ROOMS = ("geometry", "orbit", "location", "sensitivity", "estimation", "camera", "models", "adjustment", "partitioned")
+ROOMS += ("scene_adjustment", "window", "navigation", "matching", "orthoimage", "rectification", "simulation")
 
 
 def commands_page() -> str:
