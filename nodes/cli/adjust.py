@@ -36,7 +36,7 @@ from ...solver.models.platform import MOST_CLOCK_S, MOST_LEVER_ARM_M, USUAL_PLAT
 from ...solver.partitioned.engine import Engine
 from ...solver.partitioned.part import RAYS
 from ..batch.adjustment_result import CAMERA, HOPELESS, PER_LINE, PLOTS, TABLES, Adjustment, result_of, where_to_look
-from ..batch.adjustment_summary import summary_lines
+from ..batch.adjustment_summary import Content, summary_lines
 from ..batch.adjustment_tables import oriented_lines, write_tables
 from ..batch.partition_runner import DaskRunner, FolderStore, ProcessRunner
 from ..batch.scene_adjustment import SETS
@@ -155,6 +155,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    dem = _refuse_options(args)
+    paths = [path_of(path) for path in args.input]
+    args.input = args.input[0]
+    scenes = next((path for path in paths if path.is_dir() and is_scene_block(path)), None)
+    if scenes is not None:
+        _options_of_scenes(args, scenes, len(paths))
+        content = run_scenes(args)
+    else:
+        _options_of_camera_and_clock(args, len(paths))
+        content = _run_block(args, paths, dem)
+    if args.json:
+        print(json.dumps(content, indent=2))
+    else:
+        for line in summary_lines(content, verbose=args.verbose):
+            print(line)
+        if args.output and not args.quiet:
+            print(f"written to {args.output}")
+    return 0
+
+
+def _refuse_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Refuse options that go with no input; the settings of a terrain model."""
     if args.plots and not args.output:
         raise UserError("--plots needs a folder for the pictures: -o DIR")
     if args.per_line and not args.output:
@@ -170,30 +192,34 @@ def run(args: argparse.Namespace) -> int:
         refuse_unless_folder(Path(args.output))
         refuse_folder_of_inputs(Path(args.output))
     refuse_worker_options(args)
-    paths = [path_of(path) for path in args.input]
-    args.input = args.input[0]
-    scenes = next((path for path in paths if path.is_dir() and is_scene_block(path)), None)
-    if scenes is not None:
-        if args.clock_sigma:
-            raise UserError("--clock-sigma does not go with satellite scenes")
-        if args.lever_arm_sigma:
-            raise UserError("--lever-arm-sigma does not go with satellite scenes")
-        if args.camera is not None:
-            raise UserError("--camera does not go with satellite scenes")
-        if args.keep is not None:
-            raise UserError("--keep does not go with satellite scenes: their parameters are not tested")
-        if args.per_line:
-            raise UserError("--per-line does not go with satellite scenes: trajectory_refined.csv has their poses")
-        if len(paths) > 1:
-            raise UserError(f"{scenes}: a block of satellite scenes is adjusted alone")
-        if args.workers or args.scheduler:
-            raise UserError("--workers and --scheduler do not go with satellite scenes")
-        args.selfcal = args.selfcal or "none"
-        _refuse_free(args)
-        return run_scenes(args)
+    return dem
+
+
+def _options_of_scenes(args: argparse.Namespace, scenes: Path, inputs: int) -> None:
+    """Refuse options that do not go with satellite scenes, and say what is estimated where that is not said."""
+    if args.clock_sigma:
+        raise UserError("--clock-sigma does not go with satellite scenes")
+    if args.lever_arm_sigma:
+        raise UserError("--lever-arm-sigma does not go with satellite scenes")
+    if args.camera is not None:
+        raise UserError("--camera does not go with satellite scenes")
+    if args.keep is not None:
+        raise UserError("--keep does not go with satellite scenes: their parameters are not tested")
+    if args.per_line:
+        raise UserError("--per-line does not go with satellite scenes: trajectory_refined.csv has their poses")
+    if inputs > 1:
+        raise UserError(f"{scenes}: a block of satellite scenes is adjusted alone")
+    if args.workers or args.scheduler:
+        raise UserError("--workers and --scheduler do not go with satellite scenes")
+    args.selfcal = args.selfcal or "none"
+    _refuse_free(args)
+
+
+def _options_of_camera_and_clock(args: argparse.Namespace, inputs: int) -> None:
+    """Refuse options that do not go with flights, and say what is estimated where that is not said."""
     if args.sets is not None:
         raise UserError("--sets goes with a block of satellite scenes (project.toml with [scenes])")
-    if len(paths) > 1 and args.clock_sigma:
+    if inputs > 1 and args.clock_sigma:
         raise UserError("--clock-sigma goes with one recording: each has a clock of its own")
     questions = args.variance_components
     args.selfcal = args.selfcal or (LEFT if questions else "none")
@@ -202,7 +228,11 @@ def run(args: argparse.Namespace) -> int:
         tested = ", ".join(name for name in SELF_CALIBRATIONS if name != LEFT)
         raise UserError(f"--keep goes with additional parameters that are tested, wanted --selfcal, one of {tested}")
     if args.clock_sigma is None:
-        args.clock_sigma = USUAL_PLATFORM.clock_sigma_s if questions and len(paths) == 1 else 0.0
+        args.clock_sigma = USUAL_PLATFORM.clock_sigma_s if questions and inputs == 1 else 0.0
+
+
+def _run_block(args: argparse.Namespace, paths: Sequence[Path], dem: Mapping[str, Any]) -> Content:
+    """Adjust flights and write the result; its content."""
     recordings = [read_input(path) for path in paths]
     joined = join_inputs(recordings, paths) if len(paths) > 1 else None
     block = recordings[0] if joined is None else joined.block
@@ -234,14 +264,7 @@ def run(args: argparse.Namespace) -> int:
         write_result(
             adjustment, content, Path(args.output), plots=args.plots, per_line=args.per_line, camera=args.camera
         )
-    if args.json:
-        print(json.dumps(content, indent=2))
-    else:
-        for line in summary_lines(content, verbose=args.verbose):
-            print(line)
-        if args.output and not args.quiet:
-            print(f"written to {args.output}")
-    return 0
+    return content
 
 
 def _refuse_free(args: argparse.Namespace) -> None:

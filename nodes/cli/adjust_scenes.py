@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.location.refraction import Refraction
-from ..batch.adjustment_summary import summary_lines
+from ..batch.adjustment_summary import Content
 from ..batch.scene_adjustment import (
     SCENE_CALIBRATIONS,
     SCENE_MODELS,
@@ -30,8 +30,8 @@ from .locate import refraction_of
 MOST_PIECES = 60
 
 
-def run_scenes(args: argparse.Namespace) -> int:
-    """Adjust a folder, print and write the result."""
+def run_scenes(args: argparse.Namespace) -> Content:
+    """Adjust a folder and write the result; its content."""
     data = read_scene_block(Path(args.input))
     if args.refraction is not None:
         data = _in_air(data, refraction_of(args.refraction, data.ellipsoid, str(args.input)))
@@ -41,14 +41,7 @@ def run_scenes(args: argparse.Namespace) -> int:
     content = scene_result(adjustment)
     if args.output:
         content["notes"] += write_scene_result(adjustment, content, Path(args.output))
-    if args.json:
-        print(json.dumps(content, indent=2))
-    else:
-        for line in summary_lines(content, verbose=args.verbose):
-            print(line)
-        if args.output and not args.quiet:
-            print(f"written to {args.output}")
-    return 0
+    return content
 
 
 def _in_air(data: SceneBlockData, refraction: Refraction) -> SceneBlockData:
