@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from block_writer import write_block as write_block_folder
 from places import BLOCKS, needs_blocks
 from recording_file import write_recording
 
 from triline.nodes.cli import main
 from triline.nodes.cli.adjust import read_input
 from triline.nodes.formats.block_messages import block_messages, not_carried
-from triline.nodes.formats.block_writer import write_block as write_block_folder
 from triline.nodes.recording.reader import RecordingReader
 from triline.schemas.units import place_columns
 from triline.solver.camera.self_calibration import tls

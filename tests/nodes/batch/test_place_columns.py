@@ -7,13 +7,13 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
+from block_writer import write_block
 from small_block import FILES, simulated_block, write_files
 
 from triline.nodes.batch.rectification import project_frame, trajectory_orientation
 from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
-from triline.nodes.formats.block_writer import write_block
 from triline.nodes.formats.detect import kind_of_path
 from triline.nodes.formats.line_orientation import OrientedLines, write_oriented_lines
 from triline.nodes.formats.trajectory_csv import read_trajectory_csv

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from block_writer import write_block
 from bus_rig import free_port, simulated_flight
 from recording_file import chunk_spans
 from small_block import simulated_block
 
 from triline.nodes.cli import COMMANDS, main
 from triline.nodes.cli.outputs import refuse_input_as_output
-from triline.nodes.formats.block_writer import write_block
 from triline.nodes.recording.reader import RecordingReader
 from triline.nodes.recording.writer import RecordingWriter
 from triline.solver.geometry.frames import CrsError

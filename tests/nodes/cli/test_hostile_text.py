@@ -116,9 +116,8 @@ DEEP_TOML = "a = " + "[" * 5_000 + "]" * 5_000 + "\n"
 @pytest.fixture
 def block(tmp_path) -> Path:
     """A small block folder that can be spoilt."""
+    from block_writer import write_block
     from small_block import simulated_block
-
-    from triline.nodes.formats.block_writer import write_block
 
     write_block(tmp_path / "block", simulated_block())
     return tmp_path / "block"

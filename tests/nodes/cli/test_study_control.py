@@ -9,12 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from block_writer import write_block
 
 from triline.nodes.batch.simulated_scenes import SceneSimulation, write_simulated_scenes
 from triline.nodes.cli import control_runs, main
 from triline.nodes.cli.control_runs import Configuration, SceneBlock, Settings, pool_of, with_control
 from triline.nodes.formats.block_folder import read_block
-from triline.nodes.formats.block_writer import write_block
 from triline.nodes.formats.scene_block import read_scene_block
 from triline.solver.adjustment.block_data import Apriori, BlockData, ImagePoints, KnownPoints
 from triline.solver.adjustment.confidence_set import confidence_set

@@ -7,6 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
+from block_writer import write_block
 from places import BLOCKS, needs_blocks
 from small_block import FILES, simulated_block, write_files
 
@@ -15,7 +16,6 @@ from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
 from triline.nodes.formats.block_messages import block_messages, not_carried
 from triline.nodes.formats.block_recording import block_from_messages
-from triline.nodes.formats.block_writer import write_block
 from triline.nodes.formats.projection import refuse_missing_grids, unknown_heights
 from triline.solver.adjustment.block_data import network_from_block
 from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from block_writer import write_block
 from places import DATA, needs_data
 from small_block import FILES, simulated_block, write_files
 from tracks import ns, straight_track
@@ -20,7 +21,6 @@ from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
 from triline.nodes.formats.block_messages import block_messages, filled, not_carried, strip_shifts
 from triline.nodes.formats.block_recording import block_from_messages
-from triline.nodes.formats.block_writer import write_block
 from triline.nodes.formats.detect import KINDS, Options, read_any
 from triline.nodes.formats.geocal_xml import read_tie_points
 from triline.nodes.formats.gps_time import gps_from_utc_ns

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ...solver.adjustment.block_data import BlockData
-from ...solver.adjustment.network import Strip
-from ...solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion
-from .camera_json import write_camera
-from .table import write_table
+from triline.nodes.formats.camera_json import write_camera
+from triline.nodes.formats.table import write_table
+from triline.solver.adjustment.block_data import BlockData
+from triline.solver.adjustment.network import Strip
+from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion
 
 
 def write_block(folder: Path | str, block: BlockData) -> None:
