@@ -260,11 +260,11 @@ class Authority:
         rules: list[dict[str, Any]] = [_rule("out", "egress", _MESSAGES, ["triline/**"])]
         subjects: list[dict[str, Any]] = [{"id": "everybody"}]
         policies = [{"rules": ["out"], "subjects": ["everybody"]}]
-        for member in self.valid:
-            if member.kind == AIRCRAFT:
-                id = f"aircraft-{member.name}"
-                rules.append(_rule(id, "ingress", _MESSAGES, [f"triline/{member.name}/**"]))
-                subjects.append({"id": id, "cert_common_names": [member.name]})
+        for other in self.valid:
+            if other.kind == AIRCRAFT:
+                id = f"aircraft-{other.name}"
+                rules.append(_rule(id, "ingress", _MESSAGES, [f"triline/{other.name}/**"]))
+                subjects.append({"id": id, "cert_common_names": [other.name]})
                 policies.append({"rules": [id], "subjects": [id]})
         self._let_desks(rules, subjects, policies)
         if member.kind == DESK and member.routers:

@@ -32,9 +32,9 @@ def authority(tmp_path) -> Authority:
 
 def certify(authority: Authority, port: int, link_port: int, mesh_port: int = 7447) -> None:
     authority.certify("ground", ROUTER, ["127.0.0.1"], port)
+    authority.certify("ann", DESK, [], routers=[f"127.0.0.1:{port}"])
     for name in ("a1", "a2"):
         authority.certify(name, AIRCRAFT, [], mesh_port, routers=[f"127.0.0.1:{link_port}"])
-    authority.certify("ann", DESK, [], routers=[f"127.0.0.1:{port}"])
 
 
 def said(topic: str, number: int) -> RawMessage:
@@ -79,6 +79,25 @@ def test_at_a_router_aircraft_speak_for_themselves_and_desks_read(authority):
         # sessions send in order: what was forged before would have been heard before
         assert {row for row in heard if row[2] != "adjuster"} == {("a1", "observation/verdict", "desk")}
         assert len(by_others) == 1  # no aircraft hears another one
+
+
+@pytest.mark.parametrize("last", ["ground", "a1", "ann"])
+def test_who_is_let_in_does_not_depend_on_who_was_certified_last(authority, last):
+    """Desks behind a router hear routers; the nodes of an aircraft do not: its router takes what comes from below."""
+    kinds = {
+        "ground": (ROUTER, ["127.0.0.1"], []),
+        "a1": (AIRCRAFT, [], ["127.0.0.1"]),
+        "ann": (DESK, [], ["127.0.0.1"]),
+    }
+    for name in sorted(kinds, key=lambda name: name == last):
+        kind, hosts, routers = kinds[name]
+        authority.certify(name, kind, hosts, routers=routers)
+    let_in = {}
+    for name in kinds:
+        settings = json.loads((authority.folder / name / "zenoh.json5").read_text().partition("\n")[2])
+        let_in[name] = {subject["id"] for subject in settings["access_control"]["subjects"]}
+    assert ["routers" in let_in[name] for name in ("ground", "ann", "a1")] == [True, True, False]
+    assert all({"aircraft-a1", "desks"} <= subjects for subjects in let_in.values())
 
 
 def test_bundles_of_a_fleet_listen_nowhere_else_and_say_what_is_wrong(authority, tmp_path, capsys):
