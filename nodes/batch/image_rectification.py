@@ -253,7 +253,7 @@ class ImageRectification:
                 raster = self._raster(2, "float32", float("nan"), tags or {}, SIGMA_BANDS)
                 sigmas = stack.enter_context(tiled_orthoimage(sigma.path, raster, compress))
             if self.direct:
-                self._run_direct(target, classes, sigma, sigmas, told)
+                self._run_direct(target, classes, told)
             else:
                 self._run_indirect(target, classes, sigma, sigmas, told)
             if not self.counts.cells[MISSING[0]]:
@@ -422,7 +422,7 @@ class ImageRectification:
 
     # -- pixel to ground -----------------------------------------------------------------------------------------------
 
-    def _run_direct(self, target: Any, classes: Any, sigma: ErrorMap | None, sigmas: Any, told: Any) -> None:
+    def _run_direct(self, target: Any, classes: Any, told: Any) -> None:
         blocks = [(u, v) for u in range(0, self.model.lines, BLOCK_PX) for v in range(0, self.model.samples, BLOCK_PX)]
         total = self.grid.rows * self.grid.columns
         filled = 0

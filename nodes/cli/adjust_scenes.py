@@ -37,7 +37,7 @@ def run_scenes(args: argparse.Namespace) -> Content:
         data = _in_air(data, refraction_of(args.refraction, data.ellipsoid, str(args.input)))
     if data.then and args.then is None:
         data = replace(data, notes=(*data.notes, UNUSED))
-    adjustment = run_scene_job(data, scene_job(args, data))
+    adjustment = run_scene_job(data, scene_job(args))
     content = scene_result(adjustment)
     if args.output:
         content["notes"] += write_scene_result(adjustment, content, Path(args.output))
@@ -63,7 +63,7 @@ def _in_air(data: SceneBlockData, refraction: Refraction) -> SceneBlockData:
     return replace(data, images=images, notes=(*data.notes, f"refraction in the models of {len(rigorous)} images"))
 
 
-def scene_job(args: argparse.Namespace, data: SceneBlockData) -> SceneJob:
+def scene_job(args: argparse.Namespace) -> SceneJob:
     """The job that the options ask for.
 
     Raises

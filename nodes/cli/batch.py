@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         progress = progress_of(planned)
         lost = _work(planned, progress, workers, args) if progress.total else None
         result = _results(planned, progress, args.output, time.monotonic() - begun)
-    _tell(result, progress, args)
+    _tell(result, args)
     if lost:
         print(f"triline batch: {lost}", file=sys.stderr)
     return 1 if lost or progress.failed or progress.blocked else 0
@@ -272,7 +272,7 @@ def _results(planned: Sequence[Plan], progress: Progress, out: Path, seconds: fl
     return result
 
 
-def _tell(result: dict[str, Any], progress: Progress, args: argparse.Namespace) -> None:
+def _tell(result: dict[str, Any], args: argparse.Namespace) -> None:
     if args.json:
         print(json.dumps(result, indent=2))
         return

@@ -122,7 +122,7 @@ def run(args: argparse.Namespace) -> int:
         more = {"pace": pace, "notes": [*summary.notes, *of_camera]}
         print(json.dumps(result(summary, reader, args.output, seconds) | more, indent=2))
         return 0
-    for line in (*_lines(summary, reader, args.output, seconds), *(f"  note: {note}" for note in of_camera)):
+    for line in (*_lines(summary, args.output, seconds), *(f"  note: {note}" for note in of_camera)):
         print(line)
     if pace != args.pace and pace == "throughput" and ADJUSTER in summary.nodes:
         print("  live orientation is that of updates 10 s apart; that of a flight comes with --pace load")
@@ -215,7 +215,7 @@ def result(summary: ProcessSummary, reader: RecordingReader, output: Path, secon
     }
 
 
-def _lines(summary: ProcessSummary, reader: RecordingReader, output: Path, seconds: float) -> list[str]:
+def _lines(summary: ProcessSummary, output: Path, seconds: float) -> list[str]:
     flight_s = (summary.last_ns - summary.first_ns) / 1e9
     times = flight_s / max(seconds, 1e-9)
     lines = [

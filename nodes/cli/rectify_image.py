@@ -179,7 +179,7 @@ def rectified(args: argparse.Namespace, told: Any = None) -> tuple[_Sensor, Grou
         sensor.model, image, grid, ground, args.resampling, factor, float(nodata), args.occlusions, args.direct,
         ellipsoid=sensor.ellipsoid, **({} if args.workers is None else {"workers": args.workers}),
     )  # fmt: skip
-    sigma = _error_map(args, sensor, ground)
+    sigma = _error_map(args, sensor)
     tags = {
         "TIFFTAG_IMAGEDESCRIPTION": f"{Path(args.input).name} by {sensor.kind}, {ground.words}, {args.resampling}, "
         + ("pixel to ground" if args.direct else "ground to pixel")
@@ -256,7 +256,7 @@ def _sensor(args: argparse.Namespace, image: SourceImage) -> _Sensor:
         found = _camera_by_control(args, Path(args.control), model, image)
         return _Sensor(found.camera, found.camera, kind, (line, sample), sigmas, None, ellipsoid, notes, found)
     if args.control is not None:
-        fit = _correction(args, Path(args.control), model, image, sigmas)
+        fit = _correction(args, Path(args.control), model, image)
         model = CorrectedModel(model, fit.bias)
         if fit.rejected.any():
             notes.append(f"{args.control}: {int(fit.rejected.sum())} points rejected by data snooping")
@@ -339,7 +339,7 @@ def _camera_by_control(args: argparse.Namespace, path: Path, model: Any, image: 
         raise UserError(f"{path}: {error}") from None
 
 
-def _correction(args: argparse.Namespace, path: Path, model: Any, image: SourceImage, sigmas: Sigmas) -> BiasFit:
+def _correction(args: argparse.Namespace, path: Path, model: Any, image: SourceImage) -> BiasFit:
     table = _control(path, image)
     u, v = table["row"], table["column"]
     lat, lon = np.radians(table["lat_deg"]), np.radians(table["lon_deg"])
@@ -486,7 +486,7 @@ def _metres(grid: MapGrid, lat: Array, lon: Array) -> float:
 # -- errors --------------------------------------------------------------------------------------------------------
 
 
-def _error_map(args: argparse.Namespace, sensor: _Sensor, ground: Ground) -> ErrorMap | None:
+def _error_map(args: argparse.Namespace, sensor: _Sensor) -> ErrorMap | None:
     if args.sigma is None:
         return None
     stated = sensor.sigmas

@@ -390,9 +390,9 @@ def test_given_blocks(name, tmp_path):
     assert np.abs(xyz - true).max() < limit
     write_block(tmp_path, block)
     again = read_block(tmp_path)
-    for name, values in vars(block.image).items():
+    for column, values in vars(block.image).items():
         if isinstance(values, np.ndarray):
-            np.testing.assert_allclose(getattr(again.image, name), values, atol=1e-9)
+            np.testing.assert_allclose(getattr(again.image, column), values, atol=1e-9)
 
 
 @needs_blocks
