@@ -49,7 +49,7 @@ def georeference(network: Network, model: ModelOptions, ray_weight: Array | None
 
 
 def georeference_posed(network: Network, layout: Layout, prior: Prior, ray_weight: Array | None) -> Georeferenced:
-    """`georeference` with the unknowns of a model and what is known of them beforehand."""
+    """`georeference` with the unknowns of a model and what is known of them beforehand; weights (n,) of the rays."""
     state = State(np.zeros(layout.n_unknowns), network.approximate_l)
     weight = np.ones(len(network.rays)) if ray_weight is None else ray_weight
     p = network.rays.point

@@ -257,7 +257,7 @@ def that_count(columns: IntArray, blocks: Array) -> Iterator[tuple[IntArray, Arr
 
 
 def pieces(dissection: Dissection, place: IntArray) -> list[tuple[int, int, int]]:
-    """Fronts that ascending places belong to, each with the range of these places."""
+    """Fronts that ascending places (k,) belong to, each with the range of these places."""
     front = np.searchsorted(dissection.bounds, place, side="right") - 1
     starts = np.flatnonzero(np.diff(front, prepend=-1))
     ends = np.append(starts[1:], len(place))

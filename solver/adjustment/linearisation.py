@@ -166,6 +166,7 @@ def linearise_and_weigh(
 
     Parameters
     ----------
+    theta, points_l : (u,) unknowns, (p, 3) points in the local frame
     whitening : weights to be kept
     """
     n, kept = len(rays), whitening is not None

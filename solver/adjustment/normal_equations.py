@@ -235,7 +235,7 @@ def reduce_normals(
     points_l: Array,
     damping: float = 0.0,
 ) -> Reduced:
-    """Reduced normal equations at a linearisation.
+    """Reduced normal equations at a linearisation: at unknowns ``theta`` (u,) and points (p, 3), local frame.
 
     ``damping`` multiplies all diagonals by ``1 + damping`` (Levenberg-Marquardt).
     """

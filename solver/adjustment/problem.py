@@ -174,7 +174,7 @@ def assumed_of(unknowns: Layout | Unknowns, prior: Prior, theta: Array, factor: 
 
 
 def assumed_of_model(unknowns: Layout | Unknowns, prior: Prior, theta: Array, factor: Factor) -> Assumed:
-    """What is assumed of a trajectory and of the platform."""
+    """What is assumed of a trajectory and of the platform, at values ``theta`` (u,) of their unknowns."""
     B = prior.matrix.tocsr()
     rows = np.flatnonzero(np.diff(B.indptr) > 0)
     last = np.maximum.reduceat(B.indices, B.indptr[rows]) if len(rows) else rows

@@ -321,7 +321,7 @@ def cholesky(matrix: Array, raised: float, limit: float) -> tuple[Array, bool]:
 
 
 def inverse_of(factor: Array | None) -> Array:
-    """``(L L^T)^-1`` from L."""
+    """``(L L^T)^-1`` (n, n) from the lower triangle L (n, n)."""
     if factor is None or not len(factor):
         return np.empty((0, 0))
     lower, _ = _potri(factor, lower=1)

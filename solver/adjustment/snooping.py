@@ -162,7 +162,12 @@ def snoop(
 
 
 def image_scale(statistics: RayStatistics, ray_weight: Array) -> float:
-    """Sigma of the image points in units of the a-priori one, from the median of |w|, which outliers hardly move."""
+    """Sigma of the image points in units of the a-priori one, from the median of |w|, which outliers hardly move.
+
+    Parameters
+    ----------
+    statistics, ray_weight : of n rays; rays of weight (n,) 0 do not count
+    """
     w = np.abs(statistics.w[ray_weight > 0])
     w = w[w != 0.0]
     return float(np.median(w)) / 0.6745 if len(w) else 1.0

@@ -86,7 +86,7 @@ class PointAccuracy:
 
 
 def planimetric(xyz: ArrayLike) -> float:
-    """One figure for X and Y: ``sqrt((X^2 + Y^2) / 2)`` [K 4.59].
+    """One figure for X and Y of (2,) or (3,): ``sqrt((X^2 + Y^2) / 2)`` [K 4.59], in their unit.
 
     The published ADS40 figures decide against the plain sum: 0.32 and 0.57 m on 0.39 m are quoted as 1.2 px.
     """
@@ -168,7 +168,7 @@ class CorrelatedPair:
 
 
 def strongest_correlations(covariance: ArrayLike, names: tuple[str, ...], above: float = 0.9) -> list[CorrelatedPair]:
-    """Pairs of unknowns with ``|r| > above``, the strongest first."""
+    """Pairs of unknowns with ``|r| > above``, the strongest first, from their covariance (n, n) and names (n,)."""
     r = np.triu(correlations(covariance), 1)
     i, j = np.nonzero(np.abs(r) > above)
     order = np.argsort(-np.abs(r[i, j]))

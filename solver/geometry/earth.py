@@ -29,7 +29,12 @@ def curvature_radii(lat: ArrayLike) -> tuple[Array, Array]:
 
 
 def normal_gravity(lat: ArrayLike, height_m: ArrayLike) -> Array:
-    """Somigliana's normal gravity, continued upward to second order; m/s^2, positive down; latitude in radians."""
+    """Somigliana's normal gravity (...), continued upward to second order; m/s^2, positive down.
+
+    Parameters
+    ----------
+    lat, height_m : (...) latitude in radians, height above the ellipsoid
+    """
     s2 = np.sin(lat) ** 2
     g0 = GRAVITY_EQUATOR * (1.0 + SOMIGLIANA_K * s2) / np.sqrt(1.0 - ECCENTRICITY2 * s2)
     m = ROTATION_RATE**2 * SEMI_MAJOR_M**3 * (1.0 - FLATTENING) / GM

@@ -175,7 +175,7 @@ def multiply_plain(p: Sequence[float], q: Sequence[float]) -> tuple[float, float
 
 
 def quaternion_conjugate(q: ArrayLike) -> Array:
-    """Inverse of unit quaternions (scalar last)."""
+    """Inverse (..., 4) of unit quaternions (..., 4), scalar last."""
     return np.asarray(q, dtype=float) * np.array([-1.0, -1.0, -1.0, 1.0])
 
 
@@ -188,7 +188,7 @@ def quaternion_from_vector(theta: ArrayLike) -> Array:
 
 
 def vector_from_quaternion(q: ArrayLike) -> Array:
-    """Rotation vector of a unit quaternion ``xyzw``, of length at most pi."""
+    """Rotation vectors (..., 3), radians, of unit quaternions ``xyzw`` (..., 4); of length at most pi."""
     q = np.asarray(q, dtype=float)
     q = np.where(q[..., 3:] < 0, -q, q)
     sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)

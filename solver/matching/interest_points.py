@@ -20,7 +20,12 @@ MOST_HOLES = 0.35
 
 
 def image_noise(image: NDArray[np.floating], holes: NDArray[np.bool_] | None = None) -> float:
-    """Standard deviation of the noise, from second differences along and across: texture is smooth, noise is not."""
+    """Standard deviation of the noise in grey values, from second differences along and across: texture is smooth.
+
+    Parameters
+    ----------
+    image, holes : (rows, columns) grey values, and where there are none
+    """
     d = image[1:, 1:] - image[1:, :-1] - image[:-1, 1:] + image[:-1, :-1]
     if holes is not None:
         d = d[~(holes[1:, 1:] | holes[1:, :-1] | holes[:-1, 1:] | holes[:-1, :-1])]

@@ -183,7 +183,7 @@ class Prediction:
 
 
 def sample_m(scan: LineScan, point_l: Array, line: Array) -> float:
-    """Size of a pixel across on the ground, m."""
+    """Size of a pixel across, m, on the ground at points (n, 3) that are seen in lines (n,)."""
     i = np.clip(np.nan_to_num(line) - scan.first_line, 0, len(scan.position_l) - 1).astype(int)
     depth = np.median(scan.position_l[i, 2] - point_l[:, 2])
     return float(depth * scan.view.pitch_mm / scan.view.focal_length_mm)

@@ -73,7 +73,12 @@ def with_constants(columns: NDArray[np.int32], coefficients: Array, share: Array
 
 
 def describe_constants(theta: Array, sigma: Array) -> dict[str, object]:
-    """The constants as the result file shows them."""
+    """The constants as the result file shows them.
+
+    Parameters
+    ----------
+    theta, sigma : (9 or more,) offset in m, shift and drift in rad, three each, and their standard deviations
+    """
     result: dict[str, object] = {"s": "share of the strip"}
     for key, part, unit in (("offset_m", 0, 1.0), ("shift_deg", 3, 180 / np.pi), ("drift_deg", 6, 180 / np.pi)):
         for suffix, values in (("", theta), ("_sigma", sigma)):

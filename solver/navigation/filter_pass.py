@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -112,7 +113,7 @@ class FilterPass:
 
 
 def node_times(start_s: float, end_s: float, observed_s: ArrayLike, step_s: float) -> Array:
-    """Times of nodes: observations, and steps in between that are no longer than ``step_s``, from start to end."""
+    """Times of nodes (N,): observations (n,), and steps in between no longer than ``step_s``, from start to end."""
     t = np.asarray(observed_s, dtype=float)
     t = t[(t > start_s + 1e-9) & (t < end_s - 1e-9)]
     t = np.unique(np.concatenate([[start_s], t, [end_s]]))
@@ -186,12 +187,7 @@ def run_filter(
     for _, o, _ in (e for e in events if not t0 - 1e-9 <= e[0] <= t1 + 1e-9):
         unused[o.kind] = unused.get(o.kind, 0) + 1
     nodes = node_times(t0, t1, [e[0] for e in inside], settings.step_s)
-    at_node: dict[int, list[tuple[Observation, bool]]] = {}
-    for t, o, use in inside:
-        i = int(np.searchsorted(nodes, t))
-        if i == len(nodes) or (i > 0 and t - nodes[i - 1] < nodes[i] - t):
-            i -= 1
-        at_node.setdefault(i, []).append((o, use))
+    at_node = nearest_nodes(inside, nodes)
 
     pieces = cut(full, nodes)[0]
     middle = pieces.time_s - 0.5 * pieces.dt_s
@@ -246,6 +242,19 @@ def run_filter(
         gaps,
         unused,
     )
+
+
+def nearest_nodes(
+    observed: Sequence[tuple[float, Observation, bool]], nodes: Array
+) -> dict[int, list[tuple[Observation, bool]]]:
+    """Observations, and whether they are used, by the node (N,) whose time is nearest to theirs."""
+    at_node: dict[int, list[tuple[Observation, bool]]] = {}
+    for t, o, use in observed:
+        i = int(np.searchsorted(nodes, t))
+        if i == len(nodes) or (i > 0 and t - nodes[i - 1] < nodes[i] - t):
+            i -= 1
+        at_node.setdefault(i, []).append((o, use))
+    return at_node
 
 
 def integrate_blocks(pieces: InertialData, block: NDArray[np.intp], n: int, reference: tuple[Array, Array]):

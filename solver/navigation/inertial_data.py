@@ -151,7 +151,7 @@ def concatenate(parts: list[InertialData]) -> InertialData:
 
 
 def cut(data: InertialData, time_s: ArrayLike) -> tuple[InertialData, NDArray[np.intp]]:
-    """Samples cut at given times, in proportion, so that none reaches over one of them.
+    """Samples cut at given times (k,), in proportion, so that none reaches over one of them.
 
     Returns
     -------

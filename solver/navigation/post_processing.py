@@ -305,7 +305,7 @@ def _stands(time_s: Array, position: Array, sigma_m: Array) -> bool:
 
 
 def headings(time_s: Array, heading: Array, sigma: Array, step_s: float = 1.0) -> list[tuple[float, Observation]]:
-    """Heading observations (radians), thinned to one in ``step_s``."""
+    """Heading observations, thinned to one in ``step_s``, of times (n,), headings and sigmas (n,) in radians."""
     keep, last = [], -np.inf
     for i, t in enumerate(time_s):
         if t >= last + step_s - 1e-6:

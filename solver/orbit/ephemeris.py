@@ -214,7 +214,7 @@ def check_nodes(time_s: Array, values: Array, what: str, columns: int = 3) -> No
 
 
 def check_covered(time_s: Array, start_s: float, end_s: float, what: str) -> None:
-    """Refuse times outside a span.
+    """Refuse times (n,) outside a span.
 
     Raises
     ------

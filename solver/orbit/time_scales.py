@@ -83,7 +83,7 @@ def tai_from_day(mjd: int, ns_of_day: int, scale: str = "UTC") -> int:
 
 
 def tai_from_unix(utc_ns: ArrayLike) -> NDArray[np.int64]:
-    """``tai_ns`` of time stamps: nanoseconds since the Unix epoch, UTC without leap seconds."""
+    """``tai_ns`` (...) of time stamps (...): nanoseconds since the Unix epoch, UTC without leap seconds."""
     ns = np.asarray(utc_ns, dtype=np.int64)
     leap = np.round(_leap_seconds(ns // _DAY + _UNIX_EPOCH_MJD) * _SECOND).astype(np.int64)
     return ns + leap

@@ -173,7 +173,7 @@ def _posed(store: Store, key: int, network: Network) -> Plan:
 
 
 def begin(store: Store, key: int, write: int, weights: str, given: Array | None, start: State | None) -> float:
-    """Equations of a posed partition at its start; the cost there."""
+    """Equations of a posed partition at its start, with weights (n,) of its rays; the cost there."""
     part: Part = store.load(f"part-{key}")
     weight = np.ones(len(part.problem.network.rays)) if given is None else given
     equations = BlockEquations(part.problem, start, weight, weights)

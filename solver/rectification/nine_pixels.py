@@ -66,7 +66,7 @@ def nine_pixels(where: str) -> tuple[Array, Array]:
 
 
 def condition(square: Array) -> float:
-    """Condition number in the Frobenius norm, of a symmetric matrix with these eigenvalues [D 5.26]."""
+    """Condition number in the Frobenius norm, of a symmetric matrix with these eigenvalues (d,) [D 5.26]."""
     with np.errstate(divide="ignore", over="ignore"):
         return float(np.sqrt(np.sum(square**2)) * np.sqrt(np.sum(1.0 / square**2)))
 

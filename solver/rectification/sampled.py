@@ -75,7 +75,7 @@ def _terms(at: Array, order: int) -> Array:
 
 
 def metres_a_radian(lat: Array, height_m: Array, ellipsoid: Ellipsoid) -> tuple[Array, Array]:
-    """Metres east a radian of longitude, and north a radian of latitude."""
+    """Metres (...) east a radian of longitude, north a radian of latitude; at latitudes (...) in rad, heights in m."""
     e2 = ellipsoid.eccentricity2
     w2 = 1.0 - e2 * np.sin(lat) ** 2
     N = ellipsoid.semi_major_m / np.sqrt(w2)

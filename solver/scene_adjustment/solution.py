@@ -257,7 +257,12 @@ def where_rays_meet(problem: Problem) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def linearise(problem: Problem, state: State, use: NDArray[np.bool_], given: NDArray[np.bool_]) -> Normals:
-    """Normal equations of rays, known coordinates and a-priori knowledge that take part, at a state."""
+    """Normal equations of rays, known coordinates and a-priori knowledge that take part, at a state.
+
+    Parameters
+    ----------
+    use, given : (n,) which rays, and (p, 3) which known coordinates take part
+    """
     block, u = problem.block, problem.block.layout.n_unknowns
     n, p = len(block.rays), len(block.point_ids)
     point, sigma = block.rays.point, block.rays.sigma_px

@@ -132,6 +132,10 @@ def draw_slow_errors(
 ) -> ErrorRealisation:
     """Draw slow errors for a flight from ``start_s`` to ``end_s``, position and attitude each from its own stream.
 
+    Parameters
+    ----------
+    strip_s : (k, 2) begin and end of each strip
+
     Raises
     ------
     ValueError : strips that overlap in time

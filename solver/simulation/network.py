@@ -292,7 +292,7 @@ def fly(line: FlightLine, noise: Noise, rate_hz: float, rng: np.random.Generator
 def measured_trajectory(
     truth: Trajectory, model: CorrectionModel, theta: Array, noise: Noise, rng: np.random.Generator
 ) -> Trajectory:
-    """Measured = true - correction + wander."""
+    """Measured = true - correction + wander; ``theta`` (u,) are the unknowns of the correction."""
     correction = model.evaluate(theta, truth.time_s)
     sigma = np.array([noise.wander_m] * 3 + [np.radians(noise.wander_deg)] * 3)
     if sigma.any():
@@ -306,7 +306,10 @@ def measured_trajectory(
 def looks_of(
     camera: LineCamera, strip: Strip, line: FlightLine, points_l: Array, index: int
 ) -> tuple[IntArray, IntArray, IntArray, Array, Array]:
-    """Point, strip, CCD line, image line and sample of all a strip sees: Newton's method on the line condition."""
+    """Point, strip, CCD line, image line and sample (n,) of all that a strip sees of points (p, 3).
+
+    Newton's method on the line condition.
+    """
     truth = strip.trajectory
     azimuth = np.radians(line.azimuth_deg)
     along = (points_l[:, 0] - line.start[0]) * np.cos(azimuth) + (points_l[:, 1] - line.start[1]) * np.sin(azimuth)
@@ -336,7 +339,7 @@ def looks_of(
 
 
 def control_of(points_l: Array, roles: Mapping[int, str], noise: Noise, rng: np.random.Generator) -> Control:
-    """Control with its noise for some points, by index and role."""
+    """Control with its noise for some of the points (p, 3), by index and role."""
     index = np.array(sorted(roles), dtype=np.int64)
     sigma = np.tile(np.array(noise.control_m, dtype=float), (len(index), 1))
     xyz = points_l[index] + rng.normal(size=(len(index), 3)) * sigma
@@ -347,5 +350,5 @@ def control_of(points_l: Array, roles: Mapping[int, str], noise: Noise, rng: np.
 
 
 def known_points(points_l: Array, index: IntArray) -> Control:
-    """True coordinates of some points, as check points."""
+    """True coordinates of some of the points (p, 3), by index (k,), as check points."""
     return Control(index, points_l[index], np.full((len(index), 3), 1e-6))

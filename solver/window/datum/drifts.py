@@ -71,7 +71,7 @@ class Cell:
 
 
 def of_block(strip: int, places: IntArray) -> IntArray:
-    """Numbers of a strip's drift unknowns beside those of a block of strips: negative ones."""
+    """Numbers (k,) of a strip's drift unknowns at places (k,) beside those of a block of strips: negative ones."""
     return -1 - (strip * MOST_GROUPS * EACH + places)
 
 
