@@ -38,8 +38,11 @@ def some_cells(line: Array, sample: Array, height_m: Array | float, inside: NDAr
     """Evenly chosen cells of a tile (rows, columns) out of those ``inside``; none if there are none."""
     rows, columns = np.nonzero(inside)
     if len(rows) > SIDE * SIDE:
-        # the cell of those inside that is nearest to each knot of a net over them
-        i = np.linspace(0, len(rows) - 1, SIDE * SIDE).round().astype(int)
+        # some of the rows, and cells from the first to the last of each; every so many cells of all may be one column
+        some = np.unique(rows)
+        some = some[np.linspace(0, len(some) - 1, min(SIDE, len(some))).round().astype(int)]
+        ends = np.searchsorted(rows, some, side="left"), np.searchsorted(rows, some, side="right") - 1
+        i = np.linspace(*ends, -(-SIDE * SIDE // len(some))).round().astype(int).ravel()
         edge = [np.argmin(columns), np.argmax(columns), np.argmin(columns + rows), np.argmax(columns + rows)]
         keep = np.unique(np.concatenate([i, edge]))
         rows, columns = rows[keep], columns[keep]

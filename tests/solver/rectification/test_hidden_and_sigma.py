@@ -149,3 +149,12 @@ def test_slow_quantities_are_carried_over_a_tile():
     values = np.column_stack([some.line**2 - some.sample, np.ones(len(some.line))])
     got = over_cells(some, values, inside.shape)
     assert np.allclose(got[..., 0], line**2 - sample, atol=1.0) and np.allclose(got[..., 1], 1.0)
+
+
+@pytest.mark.parametrize("rows", [48, 96, 97, 480])
+def test_some_cells_of_a_whole_tile_lie_all_over_it(rows: int):
+    """One cell of so many in the order of memory is in the first or the last column where rows are a multiple of 48."""
+    row, column = np.mgrid[-1.0 : 1.0 : rows * 1j, -1.0:1.0:200j]
+    some = some_cells(100 * row, 100 * column, 0.0, np.ones(row.shape, dtype=bool))
+    got = over_cells(some, 2.0 + 0.1 * some.at[:, 1:] + 0.05 * some.at[:, :1] ** 2, row.shape)
+    assert np.allclose(got[..., 0], 2.0 + 0.1 * column + 0.05 * row**2, atol=1e-4)
