@@ -19,7 +19,7 @@ from ...solver.location.frame_camera import FrameCamera
 from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.location.rpc import Rpc
 from ...solver.location.uncertainty import Sigmas, pixel_covariance
-from ...solver.rectification.frame_parameters import TWELVE, FrameControl, FrameFit, fit_frame, prior_sigmas
+from ...solver.rectification.frame_parameters import TWELVE, FrameControl, FrameFit, fit_frame, stated_priors
 from ...solver.rectification.grid import MapGrid, default_crs
 from ...solver.rectification.pixel_to_cell import meet_terrain
 from ...solver.rectification.sampled import SomeCells, ground_steps, metres_a_radian
@@ -253,7 +253,13 @@ def _sensor(args: argparse.Namespace, image: SourceImage) -> _Sensor:
         model = CroppedModel(bare, line, sample, image.lines, image.samples)
     fit = None
     if args.control is not None and args.correction == "camera":
-        found = _camera_by_control(args, Path(args.control), model, image)
+        found = _camera_by_control(args, Path(args.control), model, image, sigmas)
+        out = found.found.rejected
+        if 2 * out.sum() > len(out):
+            notes.append(
+                f"{args.control}: {int(out.sum())} of {len(out)} points are left out: they contradict the others, or "
+                f"what {path.name} says of place and attitude (its sigma; without one as good as of a star tracker)"
+            )
         return _Sensor(found.camera, found.camera, kind, (line, sample), sigmas, None, ellipsoid, notes, found)
     if args.control is not None:
         fit = _correction(args, Path(args.control), model, image)
@@ -319,8 +325,13 @@ def _control(path: Path, image: SourceImage) -> Any:
     return table
 
 
-def _camera_by_control(args: argparse.Namespace, path: Path, model: Any, image: SourceImage) -> FrameFit:
-    """The frame camera with the parameters of `TWELVE`, by control with errors in pixel and height."""
+def _camera_by_control(
+    args: argparse.Namespace, path: Path, model: Any, image: SourceImage, sigmas: Sigmas
+) -> FrameFit:
+    """The frame camera with the parameters of `TWELVE`, by control with errors in pixel and height.
+
+    ``sigmas`` : of place and attitude, as the metadata state them
+    """
     if not isinstance(model, FrameCamera):
         raise UserError("--correction camera: goes with the whole image of a frame camera, wanted shift or affine")
     if args.sigma:
@@ -333,7 +344,7 @@ def _camera_by_control(args: argparse.Namespace, path: Path, model: Any, image: 
     try:
         return fit_frame(
             model, control, TWELVE, pixel_sigma=args.pixel_sigma or CONTROL_SIGMA_PX, height_sigma_m=height_m,
-            ground_sigma_m=height_m, prior_sigma=prior_sigmas(len(TWELVE)),
+            ground_sigma_m=height_m, prior_sigma=stated_priors(model, sigmas.position_m, sigmas.attitude_rad),
         )  # fmt: skip
     except ValueError as error:
         raise UserError(f"{path}: {error}") from None

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..estimation.mixed_model import MixedModel, MixedSolution, estimate
 from ..geometry.ellipsoid import WGS84
 from ..geometry.frames import LocalFrame
-from ..geometry.rotation import angles_from_matrix, matrix_from_angles
+from ..geometry.rotation import angles_from_matrix, angles_jacobian, matrix_from_angles
 from ..location.frame_camera import FrameCamera
 from .sampled import metres_a_radian
 
@@ -51,6 +51,25 @@ def names_of(parameters: int) -> tuple[str, ...]:
 def prior_sigmas(parameters: int) -> Array:
     """(d,) of the parameters."""
     return np.array([(PRIOR | _PRIOR_12)[name] for name in names_of(parameters)])
+
+
+def stated_priors(camera: FrameCamera, position_m: ArrayLike, attitude_rad: ArrayLike) -> Array:
+    """(12,) sigmas of the second set, those of place and attitude as they are stated.
+
+    Parameters
+    ----------
+    position_m, attitude_rad : (3,) east, north, up, and of small turns about them; where one is 0 nothing is stated
+    """
+    lat, lon, h = camera.ellipsoid.geodetic(camera.position_e)
+    east, north = metres_a_radian(lat, h, camera.ellipsoid)
+    R_el = LocalFrame(float(np.degrees(lat)), float(np.degrees(lon)), 0.0).R_el
+    by_turn = angles_jacobian(angles_from_matrix(R_el.T @ camera.R_ec))
+    angles = np.sqrt(np.square(by_turn) @ np.square(attitude_rad))
+    position = np.asarray(position_m, dtype=float)[[1, 0]] / [north, east]
+    stated = dict(zip(("omega", "phi", "kappa", "lat", "lon"), [*angles, *position], strict=True))
+    usual = prior_sigmas(len(TWELVE))
+    sigma = np.array([stated.get(name, 0.0) for name in TWELVE])
+    return np.where(sigma > 0, sigma, usual)
 
 
 def changed(camera: FrameCamera, name: str, by: float) -> FrameCamera:

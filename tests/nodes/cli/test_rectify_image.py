@@ -477,10 +477,11 @@ def test_stated_errors_of_an_rpc_are_of_each_axis(scene, tmp_path):
 
 
 def test_parameters_of_a_frame_camera_by_control(tmp_path, capsys):
-    """The metadata are off by 0.02 degrees, the control by what is stated, one point by 60 pixels."""
+    """The metadata are off by 0.02 degrees, as they state, the control by what is stated, one point by 60 pixels."""
     truth, meta, rng = tmp_path / "truth.json", tmp_path / "frame.json", np.random.default_rng(2)
     turned = json.loads(json.dumps(FRAME))
     turned["exterior"]["omega_phi_kappa_deg"][0] += 0.02
+    turned["sigma"]["attitude_deg"] = [0.02, 0.02, 0.02]
     truth.write_text(json.dumps(FRAME))
     meta.write_text(json.dumps(turned))
     camera, _ = read_frame(truth, [])
@@ -529,6 +530,37 @@ def test_parameters_of_a_frame_camera_by_control(tmp_path, capsys):
     assert "--sigma: goes with --correction shift or affine" in capsys.readouterr().err
     capsys.readouterr()
     assert main([*args, "-q"]) == 0 and "12 camera parameters" in capsys.readouterr().out
+
+
+def test_control_corrects_a_frame_camera_by_what_it_states_to_be_uncertain(tmp_path, capsys):
+    """An attitude off by half a degree, which the metadata state to a degree, or do not."""
+    truth, meta, rng = tmp_path / "truth.json", tmp_path / "frame.json", np.random.default_rng(5)
+    aerial = json.loads(json.dumps(FRAME))
+    aerial["exterior"]["height_m"], aerial["exterior"]["omega_phi_kappa_deg"] = 3000.0, [3.0, -2.0, 12.0]
+    truth.write_text(json.dumps(aerial))
+    camera, _ = read_frame(truth, [])
+    image = write_image(tmp_path / "frame.tif", np.ones((1, camera.lines, camera.samples), np.float32), nodata=-1.0)
+    line, sample, height = rng.uniform(0, 299, 16), rng.uniform(0, 399, 16), rng.uniform(700, 1100, 16)
+    lat, lon, _ = np.degrees(camera.direct(line, sample, height)).T
+    line, sample = ((a + 0.2 * rng.standard_normal(16)).clip(0, n) for a, n in ((line, 299), (sample, 399)))
+    control = tmp_path / "control.csv"
+    rows = zip(*(a.tolist() for a in (lon, lat, height, sample, line)), strict=True)
+    control.write_text("lon_deg,lat_deg,height_m,column,row\n" + "\n".join(",".join(map(repr, row)) for row in rows))
+    aerial["exterior"]["omega_phi_kappa_deg"] = [3.5, -2.3, 12.8]
+    args = ["rectify", image, "--sensor", meta, "--height", 900, "--control", control, "--correction", "camera"]
+    args += ["--pixel-sigma", 0.2, "--height-sigma", 0.01, "-o", tmp_path / "o.tif", "--json"]
+    found = {}
+    for stated in (True, False):
+        aerial["sigma"] = {"position_m": [3.0, 3.0, 5.0], "attitude_deg": [1.0, 1.0, 1.0]} if stated else {}
+        meta.write_text(json.dumps(aerial))
+        assert main([str(a) for a in args]) == 0
+        found[stated] = json.loads(capsys.readouterr().out)
+    assert found[True]["control"]["rejected"] == 0 and 0.5 < found[True]["control"]["sigma0"] < 1.6
+    kappa = found[True]["control"]["parameters"]["kappa"]
+    assert abs(kappa["change"] + np.radians(0.8)) < 3.5 * kappa["sigma"] and kappa["sigma"] < np.radians(0.1)
+    assert not [note for note in found[True]["notes"] if "left out" in note]
+    assert found[False]["control"]["rejected"] > 8
+    assert [note for note in found[False]["notes"] if "points are left out: they contradict" in note]
 
 
 @pytest.mark.parametrize("way", ["crs", "orbital", "quaternion", "navigation"])
