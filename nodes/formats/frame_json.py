@@ -123,6 +123,8 @@ def _orientation(path: Path, exterior: Keys) -> tuple[np.ndarray, np.ndarray]:
         return C, R_eo @ matrix_from_navigation(*angles) @ R_BC_NOMINAL
     if exterior.has("crs"):
         position = np.array(exterior.numbers("position", 3))
+        if exterior.text("crs") == "local":  # which of a flight begin where its project says, of an image nowhere
+            raise exterior.refuse("crs", "a projected or geographic CRS such as EPSG:32633")
         refuse_missing_grids(exterior.text("crs"), path)
         try:
             frame = LocalFrame.around(position, exterior.text("crs"))

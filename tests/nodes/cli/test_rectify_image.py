@@ -620,6 +620,14 @@ def test_angles_of_a_frame_camera_in_a_crs_are_from_its_grid_north(tmp_path, ang
     assert np.degrees(np.arctan2(east, north)) == pytest.approx(30.0, abs=1e-3)
 
 
+def test_a_frame_camera_in_local_coordinates_is_refused(tmp_path):
+    """Nobody knows where they begin: its orthoimage lay at 0 N, 0 E."""
+    exterior = {"crs": "local", "position": [100.0, 200.0, 3000.0], "omega_phi_kappa_deg": [0.0, 0.0, 0.0]}
+    (tmp_path / "f.json").write_text(json.dumps({**FRAME, "exterior": exterior}))
+    with pytest.raises(UserError, match=r"exterior.crs: 'local', wanted a projected or geographic CRS"):
+        read_frame(tmp_path / "f.json", [])
+
+
 def test_a_distortion_in_other_units_is_told(tmp_path):
     """Of normalised coordinates in place of mm: orthoimages were far too large, or an error was about the date line."""
     interior = {"focal_length_mm": 10.0, "pixel_size_mm": 0.02, "lines": 600, "samples": 800}
