@@ -25,6 +25,9 @@ Mask = NDArray[np.bool_]
 TOLERANCE_M = 1e-3
 #: Rounds of the secant; rays it does not bring to rest are searched.
 ROUNDS = 12
+#: Rounds in which the geoid is taken where the ray before met the terrain. Derived: it slopes by less than a metre in a
+#: kilometre, so that a round leaves a thousandth of the one before.
+GEOID_ROUNDS = 3
 #: Steps of the search, in cells of the raster, and at most.
 STEPS_A_CELL, MOST_STEPS = 3.0, 2000
 #: Triangles with a side this much longer than the median bridge hidden ground. Tuned.
@@ -92,9 +95,23 @@ def meet_terrain(
     seen = np.isfinite(row).all(axis=0) & np.isfinite(column).all(axis=0)
     t = np.full(n, np.nan)
     if seen.any():
-        N = terrain.undulation(lat[1][seen], lon[1][seen])
-        t[seen] = _meet(row[:, seen], column[:, seen], N, middle, half, terrain)
+        N = np.zeros(n)
+        N[seen] = _known_or_near(terrain.undulation(lat[1][seen], lon[1][seen]))
+        for _ in range(GEOID_ROUNDS):
+            t[seen] = _meet(row[:, seen], column[:, seen], N[seen], middle, half, terrain)
+            met = np.flatnonzero(np.isfinite(t))
+            there = terrain.undulation(_at(lat[:, met], t[met]), _at(lon[:, met], t[met]))
+            there = np.where(np.isfinite(there), there, N[met])
+            if not (np.abs(there - N[met]) > TOLERANCE_M).any():
+                break
+            N[met] = there
     return GroundPoints(_at(lat, t), _at(lon, t), middle + half * t)
+
+
+def _known_or_near(N: Array) -> Array:
+    """Heights of the geoid (n,); the mean one where it is not known, as beyond its raster, to begin with."""
+    known = np.isfinite(N)
+    return np.where(known, N, N[known].mean()) if known.any() else N
 
 
 def _at(values: Array, t: Array) -> Array:

@@ -69,6 +69,36 @@ def test_pixel_to_terrain_to_pixel(pushbroom, kind):
     assert np.abs(back - np.stack([line, sample], axis=1)[met]).max() < 0.01
 
 
+class OverSlopingGeoid(Waves):
+    """Waves above a geoid that slopes as in high mountains, and is not known beyond the raster."""
+
+    def undulation(self, lat, lon):
+        row, column = self.place(np.asarray(lat), np.asarray(lon))
+        inside = (row >= 0) & (row <= self.rows - 1) & (column >= 0) & (column <= self.columns - 1)
+        return np.where(inside, 40.0 + 2e-4 * 6.37e6 * (np.asarray(lat) - np.radians(self.lat_deg)), np.nan)
+
+
+def test_rays_meet_terrain_above_the_geoid_of_the_place_where_they_do():
+    """Above that of their place at the mean height points were decimetres off, and lost near the edge of the geoid."""
+    model = frame_camera()
+    relief = OverSlopingGeoid.under(model)
+    line, sample = (a.ravel() for a in np.mgrid[0 : model.lines : 12, 0 : model.samples : 12].astype(float))
+    met = meet_terrain(model, line, sample, relief, -300.0, 1050.0)
+    assert np.isfinite(met.lat).mean() > 0.99
+    height = relief.at(met.lat, met.lon) + relief.undulation(met.lat, met.lon)
+    assert np.nanmax(np.abs(met.height_m - height)) < 0.01
+    # a raster whose edges, one of them high, lie in the image
+    row, _ = relief.place(met.lat, met.lon)
+    first, last = 82, 138
+    part = OverSlopingGeoid(
+        relief.lat_deg - first * relief.step_deg, relief.lon_deg, relief.step_deg, last - first, relief.columns
+    )
+    part.z = relief.z[first:last]
+    again = meet_terrain(model, line, sample, part, -300.0, 1050.0)
+    inside = (row > first + 1) & (row < last - 2)
+    assert inside.any() and np.isfinite(again.lat[inside]).all()
+
+
 @pytest.mark.parametrize("kind", ["frame", "pushbroom"])
 def test_cells_see_the_pixels_that_the_model_says_and_both_ways_agree(pushbroom, kind):
     model = models(pushbroom)[kind]
