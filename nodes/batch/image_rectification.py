@@ -109,6 +109,7 @@ class SourceImage:
         self.descriptions = tuple(text or "" for text in source.descriptions)
         self.scales, self.offsets = tuple(source.scales), tuple(source.offsets)
         self.units = tuple(unit or "" for unit in source.units)
+        self.colors = tuple(source.colorinterp)
 
     def crop(self) -> tuple[int, int] | None:
         """Line and sample of the first pixel in the scene, where the geotransform tells it: no CRS, cells of 1."""
@@ -242,7 +243,7 @@ class ImageRectification:
             words = (tags or {}, self.image.descriptions)
             raster = self._raster(self.image.bands, self.image.dtype.name, self.nodata, *words)
             image = self.image
-            raster = replace(raster, scales=image.scales, offsets=image.offsets, units=image.units)
+            raster = replace(raster, scales=image.scales, offsets=image.offsets, units=image.units, colors=image.colors)
             target = stack.enter_context(tiled_orthoimage(output, raster, compress))
             classes = sigmas = None
             if mask is not None:

@@ -129,6 +129,7 @@ class Raster:
     rows, columns, bands, dtype, nodata : no data where nothing is written
     tags, descriptions : of the file, of its bands
     scales, offsets, units : of the values of its bands; empty for values that are meant as they stand
+    colors : what its bands show, of rasterio's ``ColorInterp``; empty for grey values
     """
 
     crs: str | None
@@ -145,6 +146,7 @@ class Raster:
     scales: tuple[float, ...] = ()
     offsets: tuple[float, ...] = ()
     units: tuple[str, ...] = ()
+    colors: tuple[Any, ...] = ()
 
 
 class Draft:
@@ -203,8 +205,11 @@ def tiled_orthoimage(
                     sparse_ok=True, interleave="band", width=raster.columns, height=raster.rows, count=raster.bands,
                     dtype=raster.dtype, nodata=raster.nodata, crs=raster.crs and CRS.from_user_input(raster.crs),
                     transform=rasterio.Affine(raster.gsd, 0.0, raster.left, 0.0, -raster.gsd, raster.top),
+                    photometric="MINISBLACK",  # else the last of four bands of bytes is how opaque the others are
                 )  # fmt: skip
             with target:
+                if raster.colors:
+                    target.colorinterp = raster.colors
                 target.update_tags(**raster.tags)
                 for k, text in enumerate(raster.descriptions):
                     target.set_band_description(k + 1, text)

@@ -404,6 +404,21 @@ FRAME = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize("how", [[], ["--plain"]])
+def test_bands_show_what_they_show_in_the_image(tmp_path, how):
+    """The infrared of an aerial image of red, green, blue and infrared said how opaque the others are."""
+    meta = tmp_path / "frame.json"
+    meta.write_text(json.dumps(FRAME))
+    bands = np.full((4, 300, 400), 100, dtype=np.uint8)
+    for k, (count, options) in enumerate([
+        (4, {"photometric": "RGB", "alpha": "NO"}), (4, {"photometric": "MINISBLACK", "alpha": "NO"}),
+        (4, {"photometric": "RGB", "alpha": "YES"}), (3, {"photometric": "RGB"}), (1, {}),
+    ]):  # fmt: skip
+        image = write_image(tmp_path / f"{k}.tif", bands[:count], **options)
+        out = rectify(tmp_path, image, meta, "--height", 900, *how, name=f"ortho{k}.tif")
+        assert out.colorinterp == rasterio.open(image).colorinterp
+
+
 def test_a_frame_camera_and_its_sigmas(tmp_path):
     meta = tmp_path / "frame.json"
     meta.write_text(json.dumps(FRAME))
