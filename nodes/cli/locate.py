@@ -36,8 +36,6 @@ _GROUND = (Column("lon_deg", low=-360.0), Column("lat_deg", low=-90.0))
 _HEIGHT = Column("height_m")
 #: With a raster of heights the column may be missing, and is not used.
 _NO_HEIGHT = Column("height_m", optional=True, blank=True)
-#: Pixels meet the terrain in groups of squares of the image with so many pixels a side: one window of the raster each.
-SQUARE_PX = 2048
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -245,17 +243,12 @@ def _met(model: Model, u: Array, v: Array, terrain: HeightRaster, scene: str, no
                 notes.append(str(reason))
             break
         low, high = below_camera(model, low, high)
-        squares = np.column_stack([u[rest] // SQUARE_PX, v[rest] // SQUARE_PX])
-        _, of = np.unique(squares, axis=0, return_inverse=True)
-        for k in range(int(of.max()) + 1):
-            some = rest[of.ravel() == k]
-            met = meet_terrain(model, u[some], v[some], terrain, low, high)
-            some, here = some[np.isfinite(met.lat)], np.isfinite(met.lat)
-            if not len(some):
-                continue
-            located[some] = np.column_stack([met.lat, met.lon, met.height_m])[here]
-            lat, lon, height_m = located[some].T
-            slope[some] = ground_slopes(terrain, lat, lon, height_m, terrain.ellipsoid)
+        met = meet_terrain(model, u[rest], v[rest], terrain, low, high)
+        here = np.isfinite(met.lat)
+        if here.any():
+            some, places = rest[here], (met.lat[here], met.lon[here], met.height_m[here])
+            located[some] = np.column_stack(places)
+            slope[some] = ground_slopes(terrain, *places, terrain.ellipsoid)
         # what is left may lie on heights that are not among those under the others
         before, rest = len(rest), rest[np.isnan(located[rest, 0])]
         if len(rest) == before:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
-from ...solver.rectification.terrain import bilinear
+from ...solver.rectification.terrain import bilinear, squares
 from ..errors import UserError
 from .keys import is_there
 from .projection import notes_of_map
@@ -324,25 +324,27 @@ class HeightRaster:
         return np.radians(lat), np.radians(lon)
 
     def at(self, lat: Array, lon: Array) -> Array:
-        """Heights above the ellipsoid (n,) at latitudes and longitudes (n,), radians, by one window."""
+        """Heights above the ellipsoid (n,) at latitudes and longitudes (n,), radians."""
         row, column = self.place(lat, lon)
         row = _within_edge(row, self.rows)
         if not self._turn:
             column = _within_edge(column, self.columns)
-        known = np.isfinite(row) & np.isfinite(column)
+        known = np.flatnonzero(np.isfinite(row) & np.isfinite(column))
         out = np.full(np.shape(lat), np.nan)
-        if not known.any():
-            return out
-        top, left = max(int(row[known].min()) - 1, -2), int(np.floor(column[known].min())) - 1
-        bottom = min(int(row[known].max()) + 3, self.rows + 2)
-        right = int(np.floor(column[known].max())) + 3
+        for part in squares(row[known], column[known]):
+            some = known[part]
+            out[some] = self._between(row[some], column[some]) + self.undulation(lat[some], lon[some])
+        return out
+
+    def _between(self, row: Array, column: Array) -> Array:
+        """Values between the cells at rows and columns (n,), by one window; NaN beyond the raster."""
+        top, left = max(int(row.min()) - 1, -2), int(np.floor(column.min())) - 1
+        bottom, right = min(int(row.max()) + 3, self.rows + 2), int(np.floor(column.max())) + 3
         if not self._turn:
             left, right = max(left, -2), min(right, self.columns + 2)
         if bottom - top < 2 or right - left < 2:
-            return out
-        z = self.heights(top, left, bottom - top, right - left)
-        out[known] = bilinear(z, row[known] - top, column[known] - left) + self.undulation(lat[known], lon[known])
-        return out
+            return np.full(len(row), np.nan)
+        return bilinear(self.heights(top, left, bottom - top, right - left), row - top, column - left)
 
 
 def _read(file: RasterFile, row: int, column: int, rows: int, columns: int, thin: int = 1) -> NDArray[np.float32]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..geometry.ellipsoid import Ellipsoid
 from .cell_to_pixel import HeightsOfTile
 from .sampled import SomeCells, ground_steps, metres_a_radian, over_cells
-from .terrain import Terrain, bilinear, slopes
+from .terrain import Terrain, bilinear, slopes, squares
 
 Array = NDArray[np.floating]
 
@@ -93,9 +93,12 @@ def place_slopes(terrain: Terrain, lat: Array, lon: Array, height_m: Array, elli
 def ground_slopes(terrain: Terrain, lat: Array, lon: Array, height_m: Array, ellipsoid: Ellipsoid) -> Array:
     """Slope (n, 2) of the terrain at places (n,), metres of height a metre east and north; NaN where none is known."""
     row, column = terrain.place(lat, lon)
-    top, left = int(np.floor(row.min())) - 1, int(np.floor(column.min())) - 1
-    z = terrain.heights(top, left, int(np.ceil(row.max())) + 2 - top, int(np.ceil(column.max())) + 2 - left)
-    by_cell = np.stack(slopes(z, row - top, column - left), axis=-1)
+    by_cell = np.empty((len(row), 2))
+    for part in squares(row, column):
+        y, x = row[part], column[part]
+        top, left = int(np.floor(y.min())) - 1, int(np.floor(x.min())) - 1
+        z = terrain.heights(top, left, int(np.ceil(y.max())) + 2 - top, int(np.ceil(x.max())) + 2 - left)
+        by_cell[part] = np.stack(slopes(z, y - top, x - left), axis=-1)
     return np.einsum("nij,ni->nj", place_slopes(terrain, lat, lon, height_m, ellipsoid), by_cell)
 
 

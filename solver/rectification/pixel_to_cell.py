@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .grid import MapGrid
-from .terrain import Terrain, bilinear
+from .terrain import Terrain, bilinear, squares
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -92,20 +92,35 @@ def meet_terrain(
     lat, lon = located[..., 0], located[..., 1]
     lon = lon[1] + (lon - lon[1] + np.pi) % (2 * np.pi) - np.pi
     row, column = (a.reshape(3, n) for a in terrain.place(lat.ravel(), lon.ravel()))
-    seen = np.isfinite(row).all(axis=0) & np.isfinite(column).all(axis=0)
+    seen = np.flatnonzero(np.isfinite(row).all(axis=0) & np.isfinite(column).all(axis=0))
     t = np.full(n, np.nan)
-    if seen.any():
-        N = np.zeros(n)
-        N[seen] = _known_or_near(terrain.undulation(lat[1][seen], lon[1][seen]))
-        for _ in range(GEOID_ROUNDS):
-            t[seen] = _meet(row[:, seen], column[:, seen], N[seen], middle, half, terrain)
-            met = np.flatnonzero(np.isfinite(t))
-            there = terrain.undulation(_at(lat[:, met], t[met]), _at(lon[:, met], t[met]))
-            there = np.where(np.isfinite(there), there, N[met])
-            if not (np.abs(there - N[met]) > TOLERANCE_M).any():
-                break
-            N[met] = there
+    if len(seen):
+        N = _known_or_near(terrain.undulation(lat[1, seen], lon[1, seen]))
+        for part in squares(row[1, seen], column[1, seen]):
+            some = seen[part]
+            t[some] = _share(*(a[:, some] for a in (lat, lon, row, column)), N[part], middle, half, terrain)
     return GroundPoints(_at(lat, t), _at(lon, t), middle + half * t)
+
+
+def _share(
+    lat: Array, lon: Array, row: Array, column: Array, N: Array, middle: float, half: float, terrain: Terrain
+) -> Array:
+    """Share of the height range (n,) at which rays meet the raster above its geoid, NaN where they do not.
+
+    ``N`` : (n,) of the geoid, where rays pass the middle of the range
+    """
+    N = N.copy()
+    for _ in range(GEOID_ROUNDS):
+        t = _meet(row, column, N, middle, half, terrain)
+        met = np.flatnonzero(np.isfinite(t))
+        if not len(met):
+            break
+        there = terrain.undulation(_at(lat[:, met], t[met]), _at(lon[:, met], t[met]))
+        there = np.where(np.isfinite(there), there, N[met])
+        if not (np.abs(there - N[met]) > TOLERANCE_M).any():
+            break
+        N[met] = there
+    return t
 
 
 def _known_or_near(N: Array) -> Array:

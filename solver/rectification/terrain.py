@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Protocol
 
 import numpy as np
@@ -10,6 +11,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating]
 
 
+#: Places that are spread over more cells than twice as many a side are looked up in squares with so many a side, each
+#: by a window of the raster of its own. Tuned: larger takes more memory, smaller more time.
+SQUARE_CELLS = 1024
 #: Places that are worked on at once. Tuned: what is computed on the way stays in the processor's cache.
 PORTION = 32_768
 
@@ -31,6 +35,20 @@ class Terrain(Protocol):
     def heights(self, row: int, column: int, rows: int, columns: int) -> NDArray[np.float32]:
         """Values of a window, NaN where nothing is known or the raster ends."""
         ...
+
+
+def squares(row: Array, column: Array) -> Iterator[NDArray[np.intp]]:
+    """Indices of places (n,) of a raster, square by square, so that none takes a window of more than its own."""
+    every = np.arange(len(row))
+    if not len(row):
+        return
+    if max(np.ptp(row), np.ptp(column)) <= 2 * SQUARE_CELLS:
+        yield every
+        return
+    i, j = (np.floor((at - at.min()) / SQUARE_CELLS).astype(np.int64) for at in (row, column))
+    key = i * (int(j.max()) + 1) + j
+    order = np.argsort(key, kind="stable")
+    yield from np.split(every[order], np.flatnonzero(np.diff(key[order])) + 1)
 
 
 def bilinear(z: NDArray[np.float32], row: Array, column: Array) -> NDArray[np.float32]:

@@ -7,10 +7,12 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+import rasterio
 from relief import Waves
 from satellite_scenes import Truth, write_dimap2, write_folder
 
 from triline.nodes.cli import main
+from triline.nodes.formats.height_raster import HeightRaster
 from triline.nodes.formats.satellite.read import read_scene
 from triline.nodes.formats.satellite.rpc_files import write_rpb
 from triline.solver.location.rpc_fit import fit_to_model
@@ -354,3 +356,31 @@ def test_a_frame_camera_over_a_terrain_that_may_be_higher_than_it(frame, summit_
     for _, row in table.iterrows():
         found = _in_image(row["lon_deg"], row["lat_deg"], row["height_m"])
         assert found == pytest.approx(row[["column", "row"]].to_numpy(float), abs=0.02)
+
+
+def test_ground_points_far_from_each_other_take_small_windows_of_the_heights(tmp_path, monkeypatch):
+    """They took one that holds all of them: 9 GB of 20 000 x 20 000 values."""
+    with rasterio.open(
+        tmp_path / "fine.tif", "w", driver="GTiff", width=6000, height=6000, count=1, dtype="int16", crs="EPSG:32633",
+        transform=rasterio.Affine(1.0, 0.0, 497_000.0, 0.0, -1.0, 4_983_000.0), tiled=True, sparse_ok=True,
+    ) as target:  # fmt: skip
+        target.write(np.full((1, 256, 256), 120, dtype=np.int16), window=rasterio.windows.Window(0, 0, 256, 256))
+        target.write(np.full((1, 112, 112), 80, dtype=np.int16), window=rasterio.windows.Window(5888, 5888, 112, 112))
+    raster, sizes = HeightRaster([tmp_path / "fine.tif"], None, "10"), []
+    heights = raster.heights
+
+    def watched(*window):
+        sizes.append(window[2] * window[3])
+        assert sizes[-1] < 6e6
+        return heights(*window)
+
+    monkeypatch.setattr(raster, "heights", watched)
+    from pyproj import Transformer
+
+    x, y = (
+        np.array([497_010.0, 502_990.0, 500_000.0, 600_000.0]),
+        np.array([4_982_990.0, 4_977_010.0, 4_980_000.0, 0.0]),
+    )
+    lon, lat = Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True).transform(x, y)
+    got = raster.at(np.radians(lat), np.radians(lon))
+    assert np.array_equal(got, [130.0, 90.0, 10.0, np.nan], equal_nan=True) and len(sizes) >= 3

@@ -15,6 +15,7 @@ from triline.solver.location.frame_camera import FrameCamera
 from triline.solver.location.refraction import Refraction
 from triline.solver.rectification.cell_to_pixel import Tile, pixels_of_tile
 from triline.solver.rectification.grid import MapGrid, default_crs
+from triline.solver.rectification.occlusion import ground_slopes
 from triline.solver.rectification.pixel_to_cell import meet_terrain, mesh_cells
 from triline.solver.rectification.sampled import metres_a_radian
 
@@ -97,6 +98,38 @@ def test_rays_meet_terrain_above_the_geoid_of_the_place_where_they_do():
     again = meet_terrain(model, line, sample, part, -300.0, 1050.0)
     inside = (row > first + 1) & (row < last - 2)
     assert inside.any() and np.isfinite(again.lat[inside]).all()
+
+
+class Fine:
+    """Heights of 500 m in cells of 4 m over all of an image of 30 km, of which no large window is read."""
+
+    cell_m = 4.0
+    largest = 0
+
+    def place(self, lat, lon):
+        return (np.radians(40.0) - np.asarray(lat)) * 6.37e6 / 4.0, (np.asarray(lon) - np.radians(31.0)) * 5e6 / 4.0
+
+    def undulation(self, lat, lon):
+        return np.zeros(np.shape(lat))
+
+    def heights(self, row: int, column: int, rows: int, columns: int) -> np.ndarray:
+        assert rows * columns < 6e6, f"a window of {rows} x {columns} values"
+        self.largest = max(self.largest, rows * columns)
+        return np.full((rows, columns), 500.0, dtype=np.float32)
+
+
+def test_pixels_far_from_each_other_take_small_windows_of_a_fine_raster():
+    """The edge of an image took a window as large as the image: 9 GB of 20 000 x 20 000 values."""
+    model, fine = frame_camera(), Fine()
+    line, sample = (a.ravel() for a in np.mgrid[0 : model.lines - 1 : 5j, 0 : model.samples - 1 : 5j])
+    met = meet_terrain(model, line, sample, fine, 490.0, 510.0)
+    row, column = fine.place(met.lat, met.lon)
+    assert np.ptp(row) * np.ptp(column) > 1e8 and fine.largest > 0
+    assert np.abs(met.height_m - 500.0).max() < 1e-3
+    level = meet_terrain(model, line, sample, 500.0)
+    assert np.allclose(met.lat, level.lat, rtol=0, atol=1e-9) and np.allclose(met.lon, level.lon, rtol=0, atol=1e-9)
+    slope = ground_slopes(fine, met.lat, met.lon, met.height_m, WGS84)
+    assert slope.shape == (25, 2) and np.abs(slope).max() == 0.0
 
 
 @pytest.mark.parametrize("kind", ["frame", "pushbroom"])
