@@ -212,6 +212,9 @@ def layer_of_orthoimage(
 ) -> Layer:
     """A finished orthoimage as a layer: its values stay where they are, the steepness is the distance to its edge.
 
+    A mask of the file, or a band that says how opaque the others are (alpha), tells which cells count; such a band
+    takes no part itself.
+
     Parameters
     ----------
     name : of the layer, for people
@@ -220,6 +223,9 @@ def layer_of_orthoimage(
     ------
     UserError : not an orthoimage of that CRS and on those cells, or a file cannot be written
     """
+    from rasterio.enums import MaskFlags
+    from rasterio.windows import Window
+
     source = RasterFile(path)
     row, column = _place(path, source, crs, gsd)
     if sigma is not None:
@@ -228,9 +234,10 @@ def layer_of_orthoimage(
             source.rows, source.columns
         ):  # fmt: skip
             raise UserError(f"{sigma}: its cells are not those of {path}")
-    dtype = np.dtype(source.dtype)
-    check_grey_values(path, source.source)
-    nodata = source.source.nodata
+    dtype, about = np.dtype(source.dtype), source.source
+    check_grey_values(path, about)
+    bands, masked = _grey_bands(about), any(MaskFlags.per_dataset in flags for flags in about.mask_flag_enums)
+    nodata = about.nodata
     if nodata is None:
         nodata = float("nan") if dtype.kind == "f" else 0.0
     factor = max(-(-max(source.rows, source.columns) // MASK_SIDE), 1)
@@ -239,11 +246,11 @@ def layer_of_orthoimage(
     for r in range(0, shape[0], 64):  # the nearest value of each place, a few rows at a time
         high = min(64, shape[0] - r)
         rows = min(high * factor, source.rows - r * factor)
-        from rasterio.windows import Window
-
         window = Window(0, r * factor, source.columns, rows)  # type: ignore[call-arg]
-        values = source.source.read(window=window, out_shape=(source.count, high, shape[1]))
-        known[r : r + high] = _valid(values, nodata).all(axis=0)
+        values = about.read(bands, window=window, out_shape=(len(bands), high, shape[1]))
+        known[r : r + high] = _valid(values, float("nan") if masked else nodata).all(axis=0)
+        if masked:
+            known[r : r + high] &= about.dataset_mask(window=window, out_shape=(high, shape[1])) != 0
     if not known.any():
         raise UserError(f"{path}: holds no value")
     inside = np.asarray(distance_transform_edt(np.pad(known, 1)))[1:-1, 1:-1].astype(np.float32)
@@ -255,23 +262,38 @@ def layer_of_orthoimage(
         for r in range(0, source.rows, PIECE):
             for c in range(0, source.columns, PIECE):
                 h, w = min(PIECE, source.rows - r), min(PIECE, source.columns - c)
-                values = _read(source, r, c, h, w)
-                valid = _valid(values, nodata).all(axis=0)
+                valid = _valid(_read(source, r, c, h, w), float("nan") if masked else nodata).all(axis=0)
+                if masked:
+                    valid &= about.dataset_mask(window=Window(c, r, w, h)) != 0  # type: ignore[call-arg]
                 if not valid.any():
                     continue
                 steep = 1.0 + 254.0 * _between(inside, factor, r, c, h, w) / middle
                 target.write(r, c, np.where(valid, np.clip(np.rint(steep), 1, 255), 0).astype(np.uint8)[None])
                 for i in range((row + r) // tile, (row + r + h - 1) // tile + 1):
                     tiles |= {(i, j) for j in range((column + c) // tile, (column + c + w - 1) // tile + 1)}
-    about = source.source
-    scaled = any(scale != 1.0 for scale in about.scales) or any(about.offsets)
+    of = np.array(bands) - 1
+    scales, offsets, units, words = (
+        tuple(np.array(values, dtype=object)[of].tolist())
+        for values in (about.scales, about.offsets, about.units, about.descriptions)
+    )
+    scaled = any(scale != 1.0 for scale in scales) or any(offsets)
+    told = {}
+    if len(bands) < source.count:
+        told["notes"] = ["its alpha band says which cells count, and is no band of the mosaic"]
     return Layer(
         name, "", str(path), str(steepness), sigma and str(sigma), row, column, source.rows, source.columns,
-        source.count, dtype.name, float(nodata), sorted(tiles), {},
-        descriptions=tuple(text or "" for text in about.descriptions) if any(about.descriptions) else (),
-        scales=tuple(about.scales) if scaled else (), offsets=tuple(about.offsets) if scaled else (),
-        units=tuple(unit or "" for unit in about.units) if any(about.units) else (),
+        len(bands), dtype.name, float(nodata), sorted(tiles), told,
+        descriptions=tuple(text or "" for text in words) if any(words) else (),
+        scales=scales if scaled else (), offsets=offsets if scaled else (),
+        units=tuple(unit or "" for unit in units) if any(units) else (),
     )  # fmt: skip
+
+
+def _grey_bands(source: Any) -> list[int]:
+    """Numbers, from 1, of the bands of a dataset that are not how opaque the others are."""
+    from rasterio.enums import ColorInterp
+
+    return [k for k, shows in enumerate(source.colorinterp, 1) if shows != ColorInterp.alpha] or list(source.indexes)
 
 
 def _place(path: Path, source: RasterFile, crs: str, gsd: float) -> tuple[int, int]:
@@ -295,7 +317,8 @@ def _place(path: Path, source: RasterFile, crs: str, gsd: float) -> tuple[int, i
 def _read(source: RasterFile, row: int, column: int, rows: int, columns: int) -> NDArray[Any]:
     from rasterio.windows import Window
 
-    return source.source.read(window=Window(column, row, columns, rows))  # type: ignore[call-arg]
+    window = Window(column, row, columns, rows)  # type: ignore[call-arg]
+    return source.source.read(_grey_bands(source.source), window=window)
 
 
 def _valid(values: NDArray[Any], nodata: float) -> NDArray[np.bool_]:
@@ -351,9 +374,7 @@ def windows_of_layers(layers: list[Layer], row: int, column: int, rows: int, col
             continue
         values = _window(layer.values, layer, row, column, rows, columns, layer.nodata)
         assert values is not None
-        known = (steep[0] > 0) & _valid(values, layer.nodata).all(axis=0)
-        if not known.any():
-            continue
+        known = steep[0] > 0
         off = np.where(known, (np.float32(255.0) - steep[0]) / np.float32(254.0), np.float32(1.0)).astype(np.float32)
         out.append(Window(index, np.where(known, values, 0).astype(np.float32), known, off))
     return out

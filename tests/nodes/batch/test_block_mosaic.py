@@ -132,6 +132,44 @@ def test_what_12_bits_saturate_says_nothing_of_tones(tmp_path, capsys):
     assert abs(other["gain"] / one["gain"] - 0.8) < 4.0 * sigma < 0.01
 
 
+@pytest.mark.parametrize("told", ["alpha", "mask"])
+def test_what_an_orthoimage_says_not_to_count_is_no_part_of_the_mosaic(told, tmp_path, capsys):
+    """Alpha of 255 was taken for saturated, so that nothing was balanced; masks did not count."""
+    y, x = np.mgrid[0:200, 0:320]
+    ground = 100.0 + 40.0 * np.sin(x / 9.0) * np.cos(y / 7.0)
+    ground[100:110, 20:30] = 0.0  # black is a value
+    files = []
+    for k, (first, gain) in enumerate([(0, 1.0), (120, 1.2)]):
+        grey = np.rint(ground[:, first : first + 200] * gain).astype(np.uint8)
+        there = np.full(grey.shape, 255, dtype=np.uint8)
+        there[50:80, 85:115] = 0  # white under it
+        bands = np.stack([grey, grey, grey, there])
+        bands[:3, there == 0] = 255
+        files.append(tmp_path / f"{k}.tif")
+        kind = {"photometric": "RGB", "alpha": "YES"} if told == "alpha" else {}
+        with rasterio.open(
+            files[-1], "w", driver="GTiff", width=200, height=200, count=4 if told == "alpha" else 3, dtype="uint8",
+            crs="EPSG:32633", transform=rasterio.Affine(0.5, 0, 5e5 + 0.5 * first, 0, -0.5, 5e6), **kind,
+        ) as target:  # fmt: skip
+            target.write(bands[: target.count])
+            if told == "mask":
+                target.write_mask(there)
+    out = tmp_path / "both.tif"
+    assert main(["rectify", *map(str, files), "--mosaic", "-o", str(out), "--workers", "1", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    for band in result["bands"]:
+        one, two = band["layers"]
+        assert one["tied"] and two["gain"] / one["gain"] == pytest.approx(1.2, abs=0.01)
+    assert len(result["bands"]) == 3
+    assert len([note for note in result["notes"] if "its alpha band says" in note]) == (2 if told == "alpha" else 0)
+    with rasterio.open(out) as mosaic:
+        values = mosaic.read()
+        assert mosaic.count == 3 and mosaic.nodata == 0
+    seen = np.ones((200, 320), dtype=bool)
+    seen[50:80, 85:115] = seen[50:80, 205:235] = False
+    assert ((values > 0) == seen).all() and values[:, 102:108, 22:28].max() == 1 and values[:, seen].max() < 200
+
+
 def test_seam_lines_are_where_the_source_changes(made):
     seams = json.loads(made.with_suffix(".seams.geojson").read_text())["features"]
     pairs = {tuple(f["properties"]["layers"]) for f in seams}
