@@ -32,6 +32,8 @@ Mask = NDArray[np.bool_]
 
 #: Cells a side of the tiles of the orthoimage, and pixels a side of the blocks of the direct way.
 TILE, BLOCK_PX = BLOCK, 256
+#: Values of the raster of heights, a side, that a tile takes at most; else it has fewer cells, down to `LEAST_TILE`.
+MOST_VALUES, LEAST_TILE = 4096, 32
 #: Places along each edge of the image whose ground points give the extent of the orthoimage.
 EDGE_PLACES = 400
 #: Megabytes that GDAL may hold of blocks it has read.
@@ -217,6 +219,18 @@ class ImageRectification:
             self._reach = reach_cells(self.model, terrain, self.ground.low_m, self.ground.high_m) + 1.0
         lat, lon = edge_of(self.model, self.ground)
         self._footprint = np.stack(self.grid.cells(lat, lon), axis=1)
+        self._side = TILE
+        while self._side > LEAST_TILE and self._side * self._heights_a_cell() > MOST_VALUES:
+            self._side //= 2
+
+    def _heights_a_cell(self) -> float:
+        """How many values of the raster of heights, a side, a cell in the middle of the orthoimage has."""
+        if not isinstance(self.ground.terrain, HeightRaster):
+            return 0.0
+        column, row = 0.5 * self.grid.columns, 0.5 * self.grid.rows
+        lat, lon = self.grid.where(np.array([column, column + 1.0, column]), np.array([row, row, row + 1.0]))
+        y, x = self.ground.terrain.place(lat, lon)
+        return float(np.max([np.hypot(y[k] - y[0], x[k] - x[0]) for k in (1, 2)]))
 
     # -- the whole -----------------------------------------------------------------------------------------------------
 
@@ -274,9 +288,10 @@ class ImageRectification:
 
     def tiles(self) -> Iterator[Tile]:
         """The tiles of the orthoimage, row by row."""
-        for row in range(0, self.grid.rows, TILE):
-            for column in range(0, self.grid.columns, TILE):
-                yield Tile(row, column, min(TILE, self.grid.rows - row), min(TILE, self.grid.columns - column))
+        for row in range(0, self.grid.rows, self._side):
+            rows = min(self._side, self.grid.rows - row)
+            for column in range(0, self.grid.columns, self._side):
+                yield Tile(row, column, rows, min(self._side, self.grid.columns - column))
 
     def _run_indirect(self, target: Any, classes: Any, sigma: ErrorMap | None, sigmas: Any, told: Any) -> None:
         tiles = list(self.tiles())

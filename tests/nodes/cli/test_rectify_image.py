@@ -17,6 +17,7 @@ from satellite_scenes import Truth, write_dimap2
 from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.formats.frame_json import read_frame
+from triline.nodes.formats.height_raster import HeightRaster
 from triline.nodes.formats.projection import missing_grids, notes_of_map
 from triline.nodes.formats.satellite.read import read_scene
 from triline.nodes.formats.satellite.rpc_files import write_rpb
@@ -633,6 +634,34 @@ def test_angles_of_a_frame_camera_in_a_crs_are_from_its_grid_north(tmp_path, ang
     located = camera.direct(np.full(2, middle), ends, np.zeros(2))
     east, north = np.diff(to_map.transform(np.degrees(located[:, 1]), np.degrees(located[:, 0])), axis=1)[:, 0]
     assert np.degrees(np.arctan2(east, north)) == pytest.approx(30.0, abs=1e-3)
+
+
+def test_large_cells_over_fine_heights_take_small_windows_of_them(tmp_path, monkeypatch):
+    """A tile of 512 cells of 20 m took all of a raster of 1 m under it: 2.4 GB of an image of 10 km."""
+    from pyproj import Transformer
+
+    aerial = json.loads(json.dumps(FRAME))
+    aerial["interior"] = {"focal_length_mm": 10.0, "pixel_size_mm": 0.02, "lines": 300, "samples": 400}
+    aerial["exterior"] |= {"lon_deg": 33.0, "height_m": 10000.0, "omega_phi_kappa_deg": [0.0, 0.0, 0.0]}
+    meta = tmp_path / "frame.json"
+    meta.write_text(json.dumps(aerial))
+    image = write_image(tmp_path / "frame.tif", np.full((1, 300, 400), 9, dtype=np.uint8))
+    y = Transformer.from_crs("EPSG:4326", "EPSG:32636", always_xy=True).transform(33.0, 39.9)[1]
+    with rasterio.open(
+        tmp_path / "fine.tif", "w", driver="GTiff", width=9000, height=9000, count=1, dtype="int16", tiled=True,
+        crs="EPSG:32636", sparse_ok=True, transform=rasterio.Affine(1.0, 0.0, 495_500.0, 0.0, -1.0, round(y) + 4500.0),
+    ) as dem:  # fmt: skip
+        dem.write(np.full((1, 256, 256), 120, dtype=np.int16), window=rasterio.windows.Window(0, 0, 256, 256))
+    heights, sizes = HeightRaster.heights, []
+
+    def watched(self, *window):
+        sizes.append(window[2] * window[3])
+        return heights(self, *window)
+
+    monkeypatch.setattr(HeightRaster, "heights", watched)
+    out = rectify(tmp_path, image, meta, "--dem", tmp_path / "fine.tif", "--dem-datum", "10")
+    assert out.res == (20.0, 20.0) and (out.read(1) == 9).sum() > 0.95 * 300 * 400
+    assert max(sizes) < 20e6
 
 
 def test_a_frame_camera_in_local_coordinates_is_refused(tmp_path):
