@@ -14,7 +14,7 @@ from ..state.network import LiveNetwork
 from .disagreement import Disagreement
 from .entry import EntryEquations, disagreement
 from .snooping import admit
-from .ties import ON_ENTRY, contradicting, drop_weak, set_apart
+from .ties import ON_ENTRY, contradicting, drop_weak, meet, set_apart
 
 
 class Arrivals:
@@ -58,6 +58,7 @@ class Arrivals:
             for name in batch.names:
                 intake.place(name, batch)
             drop_weak(batch)
+            meet(batch, network.state)
         if self._snoop:
             network.state.expect([batch.columns for batch in fresh])
             equations = [EntryEquations.of(batch, network.state) for batch in fresh]

@@ -31,12 +31,26 @@ def drop_weak(batch: Batch) -> None:
         return
     rows = batch.ties.rows(batch.origin_l, len(batch.columns))
     weak = np.zeros(batch.n_points, dtype=bool)
-    for i in np.flatnonzero(batch.ties.active & batch.ties.single & (np.diff(batch.first_ray) == 1)):
+    for i in np.flatnonzero(_of_two_strips(batch, batch.ties)):
         _, J, _, origin = batch.equations(int(i))
         least = np.linalg.eigvalsh(J.T @ J + rows.point[i].T @ rows.point[i])[0]
         away = np.linalg.norm(origin - batch.rays.position_l[batch.first_ray[i]])
         weak[i] = least < (WELL * away) ** -2
     drop_ties(batch, weak)
+
+
+def meet(batch: Batch, state: WindowState) -> None:
+    """Linearise points of one look anew where its ray meets that of a single look of an earlier strip, which has said
+    only that they lie somewhere on it."""
+    if batch.ties is not None and _of_two_strips(batch, batch.ties).any():
+        theta = state.values(batch.columns)
+        batch.back_substitute(theta)
+        batch.linearise(theta, reweigh=True)
+
+
+def _of_two_strips(batch: Batch, ties: PointTies) -> Bools:
+    """Which points (p,) lie on one ray of the batch and on a single look of an earlier strip."""
+    return ties.active & ties.single & (np.diff(batch.first_ray) == 1)
 
 
 def contradicting(batch: Batch, state: WindowState, alpha: float = INSIDE, which: Bools | None = None) -> Bools:

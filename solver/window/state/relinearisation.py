@@ -132,7 +132,7 @@ class Relinearisation:
         far = any(b.has_moved(theta, self._moved) for b, theta in zip(fresh, values, strict=True))
         due = [(b, t) for b, t in zip(fresh, values, strict=True) if far or b.points_moved() > self._moved * b.height_m]
         for batch, theta in due:
-            self._network.batches.linearise(batch, theta, reweigh=False)
+            self._network.batches.linearise(batch, theta, reweigh=True)  # rays were fitted to where points were
         if far:
             new = {id(b) for b in fresh}
             self._suspects = {id(b): b for b in self._network.batches if id(b) not in new}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from three_strips import OPTIONS, PLAN, SIDE_BY_SIDE, TIES, flown, usual, usual_at_once, usual_online
 
+from triline.solver.camera.self_calibration import left_by_calibration
 from triline.solver.simulation.window_study import adjust_at_once, adjust_online, orientation_errors
 from triline.solver.window.block import archive, points
 from triline.solver.window.block.points import SingleLook
@@ -50,6 +51,25 @@ def test_a_single_look_counts_when_another_strip_sees_its_point(online):
         sigma = np.sqrt(np.diag(wanted.covariance))
         assert np.abs((whole.xyz_l - wanted.xyz_l) / sigma).max() < 0.1
         assert np.sqrt(np.diag(whole.covariance)) == pytest.approx(sigma, rel=0.02)
+
+
+def test_points_of_single_looks_lie_where_the_looks_meet(monkeypatch):
+    """Nadir looks alone, which are first thought to meet the ground 100 m too high; the camera has parameters, so rays
+    are fitted to their points, and the attitude changes fast between the two places."""
+    simulation, poses = unsteady = flown(replace(PLAN, strips=1, stabilised=False))
+    nadir = simulation.images.looks.ccd == simulation.flight.camera.line_index["N"]
+    unsteady = replace(simulation, images=simulation.images.select(nadir)), poses
+    make, open_ = BatchMaker.make_single, left_by_calibration(simulation.flight.camera)
+    monkeypatch.setattr(BatchMaker, "make_single", lambda *a: make(*a[:-1], a[-1] + [0.0, 0.0, 100.0]))
+    online = adjust_online(*unsteady, replace(OPTIONS, snoop=True), open_, live=False, update_s=0.5)
+    batch = adjust_at_once(*unsteady, OPTIONS, open_)
+    assert not any("do not agree" in text for text in online.events)
+    met = [name for name, point in online.whole_points.items() if point.rays == 2]
+    assert len(met) > 15
+    for name in met:
+        whole, wanted = online.whole_points[name], batch.final_points[name]
+        sigma = np.sqrt(np.diag(wanted.covariance))
+        assert np.abs((whole.xyz_l - wanted.xyz_l) / sigma).max() < 0.1
 
 
 @pytest.mark.parametrize("later", [False, True])
