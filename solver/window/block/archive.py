@@ -211,7 +211,8 @@ class Archive:
         control = np.where(before > 0, 0.0, batch.ties.control[i])
         rows = [rays] if old is None else [rays, old.functions.rows(old.place, origin)]
         point, matrix, rhs, _ = eliminated(rows, np.diag(control), batch.control.xyz_l[i], origin)
-        if np.linalg.cond(point.factor[0]) ** 2 > PLACED:
+        # a point that no look is left of lies where it is known to be, and says nothing
+        if not len(point.columns) or np.linalg.cond(point.factor[0]) ** 2 > PLACED:
             return
         self.add(point.columns, matrix, rhs)
         seen = frozenset(r.look.strip for r in published.residuals)

@@ -269,6 +269,25 @@ def test_a_control_point_seen_again_in_one_look_ties_and_is_not_weighted_again(f
         assert point.rays > 1 and np.sqrt(np.diag(point.covariance)).min() > 0.02 / np.sqrt(2)
 
 
+def test_control_whose_looks_in_a_later_strip_are_all_refused_leaves_the_block_as_it_was():
+    """It is seen there once, far from where it is: neither the earlier strip nor its coordinates agree."""
+    simulation, poses = flown(replace(SIDE_BY_SIDE, sidelap=0.6))
+    images, roles = simulation.images, simulation.points.role
+    in_second = images.looks.strip == 1
+    seen = {int(i) for i in images.looks.point[in_second] if roles[i] == "control"}
+    point = min(seen & set(images.looks.point[~in_second].tolist()))
+    again = np.flatnonzero(in_second & (images.looks.point == point))
+    keep = np.ones(len(images), dtype=bool)
+    keep[again[1:]] = False
+    sample = images.sample + 1000.0 * (np.arange(len(images)) == again[0])
+    wrong = replace(simulation, images=replace(images, sample=sample).select(keep))
+    result = adjust_online(wrong, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
+    name = str(simulation.points.id[point])
+    assert "snooping" in [r.reason for r in result.refused if r.point == name]
+    assert {r.look.strip for r in result.whole_points[name].residuals} == {"S1"}
+    assert {o.strip for o in result.whole} == {"S1", "S2"}
+
+
 @pytest.mark.study
 def test_a_single_look_ties_a_later_strip_unless_it_contradicts(flight):
     """With single looks alone a later strip is better than without; one that is wrong is not used."""
