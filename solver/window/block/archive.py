@@ -135,6 +135,7 @@ class Archive:
 
         Points that tie strips come in batches of their own (`Batch.ties`). Theirs is the information of the new rays
         and of the earlier strip's coordinates, with all unknowns of that strip instead of the modes that stood for it.
+        Where both contradict each other the point is where more looks say that it is.
 
         Parameters
         ----------
@@ -201,9 +202,9 @@ class Archive:
         """A point of a batch that ties strips became final."""
         assert batch.ties is not None
         rays, origin = rows_of(batch, i, cell)
-        old = self.points.get(published.name)
+        old, apart = self.points.get(published.name), None
         if old is not None and not (batch.ties.active[i] and self.holds(old.functions.columns)):
-            old = None
+            old, apart = None, old if self.holds(old.functions.columns) else None
         if old is not None and old.single is not None:
             left = old.single.left(batch.points_l[i])
             old = None if left is None else replace(old, left=left)
@@ -215,6 +216,9 @@ class Archive:
         if not len(point.columns) or np.linalg.cond(point.factor[0]) ** 2 > PLACED:
             return
         self.add(point.columns, matrix, rhs)
+        if apart is not None and apart.point.rays > published.rays:  # more looks say where it is than contradict them
+            self._keep(published.name, apart.doubted())
+            return
         seen = frozenset(r.look.strip for r in published.residuals)
         if old is not None:
             seen |= old.strips

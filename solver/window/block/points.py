@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -52,6 +52,12 @@ class KeptPoint:
     def point(self) -> AdjustedPoint:
         """As it was published."""
         return self.left.points[self.place]
+
+    def doubted(self) -> KeptPoint:
+        """The point with a strip that contradicts it."""
+        f, own = self.functions, slice(self.place, self.place + 1)
+        functions = EliminatedPoints(f.columns, f.origin_l[own], f.factor[own], f.y[own], f.coupling[own])
+        return replace(self, left=LeftPoints(functions, (self.point._replace(checked="doubtful"),)), place=0)
 
 
 @dataclass(frozen=True)

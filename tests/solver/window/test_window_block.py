@@ -243,6 +243,25 @@ def test_a_point_taken_for_another_ties_nothing(flight, online):
     assert far_apart(*kept)[0] < 1.5
 
 
+def test_a_point_that_strips_contradict_each_other_at_is_where_more_looks_say(flight):
+    """Two of the three looks of a later strip are there, and wrong alike; they took the place of three good ones."""
+    simulation, poses = flight
+    images, roles = simulation.images, simulation.points.role
+    seen = [np.bincount(images.looks.point[images.looks.strip == s], minlength=len(roles)) for s in range(2)]
+    point = np.flatnonzero((seen[0] == 3) & (seen[1] == 3) & (roles == "tie"))[0]
+    again = np.flatnonzero((images.looks.strip == 1) & (images.looks.point == point))
+    keep = (images.looks.strip < 2) | (images.looks.point != point)
+    keep[again[0]] = False
+    sample = images.sample + 60.0 * np.isin(np.arange(len(images)), again)
+    wrong = replace(simulation, images=replace(images, sample=sample).select(keep))
+    result = adjust_online(wrong, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
+    name = str(simulation.points.id[point])
+    assert any("do not agree with earlier strips" in text and name in text for text in result.events)
+    whole, off = result.whole_points[name], result.whole_points[name].xyz_l - simulation.points.xyz_l[point]
+    assert whole.checked == "doubtful" and {r.look.strip for r in whole.residuals} == {"S1"} and whole.rays == 3
+    assert off @ np.linalg.solve(whole.covariance, off) < 16.0
+
+
 def seen_again_once(simulation, role):
     """The flight with points of a role seen only once in the strips after the first, their places, and those looks."""
     looks = simulation.images.looks
