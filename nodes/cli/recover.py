@@ -30,8 +30,9 @@ def run(args: argparse.Namespace) -> int:
     part = args.output.with_name(args.output.name + ".part")
     try:
         with RecordingWriter(part) as writer:
-            for channel, raw in zip(reader.index.channel[numbers].tolist(), reader.raws(numbers), strict=True):
-                writer.write_raw(raw, reader.channels[channel].platform or None)
+            for number, raw in zip(reader.index.channel[numbers].tolist(), reader.raws(numbers), strict=True):
+                channel = reader.channels[number]
+                writer.write_raw(raw, channel.platform or None, channel.every)
         os.replace(part, args.output)
     except OSError as error:
         raise UserError(f"{args.output}: cannot be written: {(error.strerror or str(error)).lower()}") from None

@@ -37,7 +37,7 @@ class RecordingWriter:
     platform : name of the platform, kept with each channel
     chunk_size : bytes after which a chunk is closed
     every : of a topic only each message whose number this divides is meant to be there (`bus.downlink`); kept with each
-        channel, so that the others are not taken for lost
+        channel, so that the others are not taken for lost. Channels of another recording keep what they say there
     """
 
     def __init__(
@@ -91,12 +91,12 @@ class RecordingWriter:
         envelope = Envelope(message.stamp_ns, message.source, sequence)
         self.write_raw(RawMessage(message.topic, envelope, codec.encode(message.body), receive_ns or message.stamp_ns))
 
-    def write_raw(self, raw: RawMessage, platform: str | None = None) -> None:
-        """Add a message that is encoded already."""
+    def write_raw(self, raw: RawMessage, platform: str | None = None, every: int = 1) -> None:
+        """Add a message that is encoded already, of a channel of which only every so many are meant to be there."""
         topic, (stamp_ns, source, sequence, start), data, receive_ns = raw
         channel = self._plain.get((topic, source, start)) if platform is None else None
         if channel is None:
-            self._write_first(raw, platform)
+            self._write_first(raw, platform, every)
         else:
             self._writer.add_message(channel, receive_ns, data, stamp_ns, sequence & _SEQUENCE_MASK)
 
@@ -107,11 +107,11 @@ class RecordingWriter:
             channel = plain.get((of.topic, of.source, of.start))
             if channel is None:
                 envelope = Envelope(stamp_ns, of.source, sequence, of.start)
-                self._write_first(RawMessage(of.topic, envelope, data, stamp_ns), None)
+                self._write_first(RawMessage(of.topic, envelope, data, stamp_ns), None, of.every)
             else:
                 add(channel, stamp_ns, data, stamp_ns, sequence & _SEQUENCE_MASK)
 
-    def _write_first(self, raw: RawMessage, platform: str | None) -> None:
+    def _write_first(self, raw: RawMessage, platform: str | None, every: int) -> None:
         """Add a message of the configuration, or one that may be the first of its channel or platform."""
         configuring = self._configuring.get(raw.topic)
         if configuring is None:
@@ -123,21 +123,21 @@ class RecordingWriter:
         elif self._head:
             self._head = False
             self.flush()
-        channel = self._add(raw, platform)
+        channel = self._add(raw, platform, every)
         if platform is None and not configuring:
             self._plain[raw.topic, raw.envelope.source, raw.envelope.start] = channel
 
-    def _add(self, raw: RawMessage, platform: str | None, *, copy: bool = False) -> int:
+    def _add(self, raw: RawMessage, platform: str | None, every: int = 1, *, copy: bool = False) -> int:
         topic, (stamp_ns, source, sequence, start), data, receive_ns = raw
         key = (topic, source, start, platform or self._platform, copy)
         channel = self._channels.get(key)
         if channel is None:
-            channel = self._channels[key] = self._register(*key)
+            channel = self._channels[key] = self._register(*key, max(every, self._every(topic)))
         number = sequence & _SEQUENCE_MASK
         self._writer.add_message(channel, receive_ns, data, stamp_ns, number)
         return channel
 
-    def _register(self, topic: str, source: str, start: int, platform: str, copy: bool) -> int:
+    def _register(self, topic: str, source: str, start: int, platform: str, copy: bool, every: int) -> int:
         row = topics.find(topic)
         schema = self._schemas.get(row.type_name)
         if schema is None:
@@ -149,8 +149,8 @@ class RecordingWriter:
             metadata["start"] = str(start)
         if copy:
             metadata["copy"] = "yes"
-        if self._every(topic) > 1:
-            metadata["every"] = str(self._every(topic))
+        if every > 1:
+            metadata["every"] = str(every)
         channel = self._writer.register_channel(topic, MessageEncoding.Protobuf, schema, metadata)
         # A channel stands in the first chunk that uses it; written once more outside chunks it survives that chunk.
         self._writer.add_metadata(CHANNEL_METADATA, {"id": str(channel), "topic": topic, **metadata})

@@ -126,6 +126,19 @@ def test_recover(capsys, flight, tmp_path):
     assert not (tmp_path / "x.mcap").exists()
 
 
+def test_what_a_thinned_topic_leaves_out_is_not_missing_in_copies(capsys, tmp_path):
+    thinned, recovered, copied = (tmp_path / f"{name}.mcap" for name in ("thinned", "recovered", "copied"))
+    with RecordingWriter(thinned, every=lambda topic: 5 if topic == "sensor/gnss" else 1) as writer:
+        for i in (0, 5, 10):
+            writer.write(Message("sensor/gnss", sample.EPOCH_NS + i, sample.body("sensor/gnss", i), "test", i))
+    assert run(capsys, "recover", thinned, "-o", recovered)[0] == 0
+    reader = RecordingReader(thinned)
+    with RecordingWriter(copied) as writer:  # as `process` copies what it has read
+        writer.write_recorded(reader.recorded(reader.select()))
+    for path in (thinned, recovered, copied):
+        assert run(capsys, "check", path) == (0, f"{path}: whole, 3 messages in 1 chunks\n", "")
+
+
 # ---- process
 
 
