@@ -286,7 +286,8 @@ def _header(path: Path, columns: Sequence[Column], notes: list[str]) -> list[str
         raise UserError(
             (there and _not_utf8(path)) or f"{path}:1: not a text table, wanted a header with {_names(columns)}"
         )
-    repeated = {name for name in header if header.count(name) > 1}
+    known = {name for column in columns for name in column.names}
+    repeated = {name for name in header if name in known and header.count(name) > 1}
     if repeated:
         raise UserError(f"{path}:1: {sorted(repeated)[0]}: this column comes twice")
     for column in columns:
@@ -296,8 +297,8 @@ def _header(path: Path, columns: Sequence[Column], notes: list[str]) -> list[str
     if missing:
         hint = "; is the separator a comma?" if len(header) == 1 and any(c in header[0] for c in "\t ") else ""
         raise UserError(f"{path}:1: {missing[0]}: column missing, wanted {_names(columns)}{hint}")
-    known = {name for column in columns for name in column.names}
-    notes.extend(f"{path.name}: column {name!r} is not known and was ignored" for name in header if name not in known)
+    ignored = dict.fromkeys(name for name in header if name not in known)
+    notes.extend(f"{path.name}: column {name!r} is not known and was ignored" for name in ignored)
     return header
 
 

@@ -109,9 +109,7 @@ def instants_ns(texts: Sequence[str], what: Callable[[int], str]) -> NDArray[np.
     ------
     UserError : naming the first that cannot be read
     """
-    import pandas as pd
-
-    read = pd.to_datetime(pd.Series(texts, dtype=object), format="ISO8601", utc=True, errors="coerce")
+    read = _read_words(texts)
     for i in np.flatnonzero(read.isna().to_numpy())[:1].tolist():
         raise UserError(f"{what(i)}: {texts[i]!r}, wanted an ISO 8601 time as 2024-05-17T09:30:00.5Z")
     time_ns = _datetime_ns(read)
@@ -129,17 +127,23 @@ def _datetime_ns(times: pd.Series) -> NDArray[np.int64]:
     return times.dt.tz_convert(None).to_numpy().astype("datetime64[ns]").astype(np.int64)
 
 
-def _from_words(table: Table, columns: list[Column]) -> NDArray[np.int64]:
+def _read_words(words: Iterable[str]) -> pd.Series:
+    """ISO 8601 times as pandas reads them, NaT for what is none; ISO 8601 has decimal commas as well as points."""
     import pandas as pd
 
+    points = [word.replace(",", ".") for word in words]
+    return pd.to_datetime(pd.Series(points, dtype=object), format="ISO8601", utc=True, errors="coerce")
+
+
+def _from_words(table: Table, columns: list[Column]) -> NDArray[np.int64]:
     name = columns[0].name
     words = table[name].astype(str)
     if len(columns) > 1:
         words = np.array([f"{d}T{t}" for d, t in zip(table["date"].astype(str), words, strict=True)], dtype=object)
     else:
-        plain = np.array([word.replace(".", "", 1).isdigit() for word in words])
+        plain = np.array([word.replace(",", ".").replace(".", "", 1).isdigit() for word in words])
         table.refuse(plain, name, lambda i: f"{words[i]} has no scale, wanted an ISO 8601 time, or a column {WANTED}")
-    read = pd.to_datetime(pd.Series(words, dtype=object), format="ISO8601", utc=True, errors="coerce")
+    read = _read_words(words)
     wanted = "wanted an ISO 8601 time as 2024-05-17T09:30:00.5Z"
     table.refuse(read.isna().to_numpy(), name, lambda i: f"{str(words[i])!r}, {wanted}")
     time_ns = _datetime_ns(read)

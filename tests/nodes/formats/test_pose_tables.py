@@ -150,6 +150,32 @@ def test_names_and_values_between_quotes_below_a_blank_line(tmp_path, sep):
     assert line_times(times, None, []).tolist() == [ns(START) + 500_000_000, ns(START) + 750_000_000]
 
 
+def test_empty_columns_and_others_that_come_twice_are_ignored(tmp_path):
+    """As spreadsheets write them: two empty columns were a column without a name that "comes twice"."""
+    rows = [f"{1591012800 + i},{LAT[i]:.6f},{LON[i]:.6f},2000,1.5,-2.5,45,7,8,," for i in range(N)]
+    path = tmp_path / "p.csv"
+    path.write_text("\n".join([f"time_s,{COLUMNS},fix,fix,,", *rows]) + "\n")
+    track = read_track(path, "csv", Options())
+    np.testing.assert_allclose(track.geodetic[:, 1], LON, atol=1e-6)
+    assert sum("is not known and was ignored" in note for note in track.notes) == 2  # each name once
+    path.write_text(path.read_text().replace("fix,fix", "time_s,fix"))
+    with pytest.raises(UserError, match=r"p\.csv:1: time_s: this column comes twice"):
+        read_track(path, "csv", Options())
+
+
+def test_times_in_words_with_decimal_commas(tmp_path):
+    """ISO 8601 has them, and tables with decimal commas."""
+    rows = [
+        f"2020-06-01T12:00:{i:02d},25Z;{LAT[i]:.6f};{LON[i]:.6f};2000,0;1,5;-2,5;45,0".replace(".", ",")
+        for i in range(N)
+    ]
+    path = tmp_path / "p.csv"
+    path.write_text("\n".join([f"time;{COLUMNS.replace(',', ';')}", *rows]) + "\n")
+    track = read_track(path, "csv", Options())
+    assert track.time_ns.tolist() == [ns("2020-06-01T12:00:00") + i * 10**9 + 250_000_000 for i in range(N)]
+    np.testing.assert_allclose(track.geodetic[:, 1], LON, atol=1e-6)
+
+
 @pytest.mark.parametrize("text, line", [("point,X_m,Höhe\nA,1,2\n", 1), ("point,X_m\nA,1\nMühle,2\n", 3)])
 def test_a_table_that_is_not_utf8_is_told_by_its_line(tmp_path, text, line):
     """As German spreadsheets save a CSV unless they are told otherwise."""
