@@ -17,7 +17,7 @@ from ...solver.navigation.inertial_data import MEMS, GnssData, InertialData, Ine
 from ..convert import LATEST_S
 from ..errors import UserError
 from .keys import Keys, read_toml
-from .table import Column, Table, read_table
+from .table import Column, Table, read_table, separator_of
 from .track import MOST_BORESIGHT_DEG, MOST_LEVER_ARM_M
 
 Array = NDArray[np.floating]
@@ -243,14 +243,15 @@ def _all_there(path: Path, table: Table, names: tuple[str, ...]) -> bool:
 
 
 def _parsed(table: Table, names: tuple[str, ...]) -> Array:
-    """Columns of text as numbers; empty is NaN."""
+    """Columns of text as numbers, with the decimal sign of the file; empty is NaN."""
     out = np.full((len(table), len(names)), np.nan)
+    signs = str.maketrans(",.", ".,") if separator_of(table.path)[1] == "," else {}
     for k, name in enumerate(names):
         words = table[name]
         bad = np.zeros(len(words), dtype=bool)
         for i, word in enumerate(words):
             try:
-                out[i, k] = float(word) if word else np.nan
+                out[i, k] = float(word.translate(signs)) if word else np.nan
             except ValueError:
                 bad[i] = True
         table.refuse(bad, name, lambda row, words=words: f"{words[row]!r} is not a number, wanted a number")

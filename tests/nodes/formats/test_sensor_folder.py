@@ -196,6 +196,21 @@ def test_traps_end_in_one_line_that_names_cause_and_column(tmp_path, capsys, mak
     assert not (tmp_path / "out").exists()
 
 
+def test_semicolons_and_decimal_commas(tmp_path):
+    """Sigmas and velocities of fixes are read as text, and were no numbers with decimal commas."""
+    plain, folder = read_sensor_folder(write(tmp_path / "points")), write(tmp_path / "commas")
+    for name in ("imu.csv", "gnss.csv"):
+        path = folder / name
+        path.write_text(path.read_text().replace(",", ";").replace(".", ","))
+    read = read_sensor_folder(folder)
+    np.testing.assert_array_equal(read.force, plain.force)
+    for name in ("time_s", "lat", "lon", "height_m", "sigma_ned_m"):
+        np.testing.assert_array_equal(getattr(read.gnss, name), getattr(plain.gnss, name))
+    edit(folder / "gnss.csv", 3, ";0,", ";0.")
+    with pytest.raises(UserError, match=r"gnss\.csv:3: sigma_n_m: '0\.\d+' is not a number"):
+        read_sensor_folder(folder)
+
+
 def test_malformed_files_name_file_line_and_column(tmp_path):
     folder = write(tmp_path / "flight")
     edit(folder / "imu.csv", 5, ",", ",x")
