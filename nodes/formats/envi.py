@@ -36,9 +36,9 @@ def read_header(path: Path) -> dict[str, str]:
 
 
 def header_of(path: Path) -> Path | None:
-    """The header beside a binary file, if there is one."""
-    found = [p for p in (path.with_name(path.name + ".hdr"), path.with_suffix(".hdr")) if p.is_file()]
-    return found[0] if found else None
+    """The header beside a binary file, if there is one; some systems write names in capitals."""
+    beside = [p for end in (".hdr", ".HDR") for p in (path.with_name(path.name + end), path.with_suffix(end))]
+    return next((p for p in beside if p.is_file()), None)
 
 
 def header_integer(path: Path, header: dict[str, str], key: str, default: int | None = None, low: int = 0) -> int:

@@ -120,7 +120,8 @@ def _both(path: Path) -> tuple[Path, Path]:
     if path.suffix.lower() == ".hdr":
         if not path.is_file():
             raise UserError(f"{path}: no such file")
-        found = [p for p in (path.with_suffix(s) for s in _DATA_SUFFIXES) if p.is_file()]
+        suffixes = (*_DATA_SUFFIXES, *(s.upper() for s in _DATA_SUFFIXES))
+        found = [p for p in (path.with_suffix(s) for s in suffixes) if p.is_file()]
         if not found:
             raise UserError(f"{path}: no image beside it, wanted {path.stem} with .img, .bil, .bip, .bsq, .raw or .dat")
         return path, found[0]

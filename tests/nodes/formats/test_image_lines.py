@@ -67,6 +67,19 @@ def test_every_order_of_values_gives_the_same_grey_values(tmp_path, interleave, 
     np.testing.assert_array_equal(both.read(0, 50), np.rint(cube[..., 0] * 0.5 + cube[..., 2] * 0.25))
 
 
+@pytest.mark.parametrize("header", ["A.HDR", "A.IMG.HDR"])
+def test_names_in_capitals(tmp_path, header):
+    """As cards of cameras have them: the image was "of no known kind"."""
+    cube = cube_of("u1")
+    image = write_image(tmp_path / "a.img", cube).rename(tmp_path / "A.IMG")
+    (tmp_path / "a.hdr").rename(tmp_path / header)
+    assert kind_of_path(image) == "lines"
+    for name in ("A.IMG", header):
+        opened = open_envi(tmp_path / name)
+        assert opened.path == image
+        np.testing.assert_array_equal(GreyImage(opened, opened.weights("2")).read(0, 50), cube[..., 1])
+
+
 def test_bands_by_name_and_values_in_a_range(tmp_path):
     cube = cube_of("f4") / np.float32(400.0)
     cube[0, 0, 1], cube[0, 1, 1] = np.nan, 2.0
