@@ -23,6 +23,7 @@ from ..node import Node
 from ..recording.reader import RecordingReader
 from ..recording.remote import path_of
 from ..recording.runner import ProcessSummary, process
+from ..recording.summary import damage_lines
 from ..recording.writer import COMPRESSIONS, RecordingWriter
 from .damage import tell_damage
 from .dem_options import add_dem_options, dem_settings
@@ -206,7 +207,7 @@ def result(summary: ProcessSummary, reader: RecordingReader, output: Path, secon
         "replaced": dict(sorted(summary.replaced.items())),
         "dropped": dict(sorted(summary.dropped.items())),
         "notes": summary.notes,
-        "damage": [str(damage) for damage in reader.damage],
+        "damage": damage_lines(reader),
         "lost_bytes": sum(damage.length for damage in reader.damage),
         "counters": summary.counters,
         "problems": summary.problems,

@@ -20,7 +20,7 @@ from .integrity import LIGHTS
 MOST_LINES = 60
 _COLUMNS = (
     "flight", "state", "seconds", "strips", "rays", "rejected", "sigma0", "nees", "good", "weak", "failed", "rmse_X_m",
-    "rmse_Y_m", "rmse_Z_m", "against", "adjust_sigma0", "adjust_rejected", "reason", "recording",
+    "rmse_Y_m", "rmse_Z_m", "against", "adjust_sigma0", "adjust_rejected", "damage", "reason", "recording",
 )  # fmt: skip
 
 
@@ -32,6 +32,7 @@ def flight_rows(plans: Sequence[Plan], progress: Progress) -> list[dict[str, Any
     dicts with
 
     - ``flight, recording, bytes``; ``state``: "finished", "failed" or "unfinished"; ``reason``: of the first failure;
+      ``damage``: what of the recording could not be read, a line each, as the first step that met it said;
     - ``steps``: by name ``state`` ("finished", "failed", "not begun"), ``reason``, ``seconds`` (of the job),
       ``attempts``, ``output`` and ``log`` (paths below the folder of results, None where they are not);
     - ``seconds, strips, rays, rejected, sigma0, nees, light`` (shares of LIGHTS in ``lit_s``, the time on strips),
@@ -58,6 +59,7 @@ def _row(plan: Plan, progress: Progress) -> dict[str, Any]:
         "bytes": plan.source.size,
         "state": state,
         "reason": next((f"{name}: {step['reason']}" for name, step in steps.items() if step["reason"]), None),
+        "damage": next(filter(None, map(_damage, told.values())), []),
         "steps": steps,
         "seconds": held.get("seconds"),
         "strips": held.get("strips"),
@@ -94,6 +96,13 @@ def _step(plan: Plan, name: str, progress: Progress) -> dict[str, Any]:
     }
 
 
+def _damage(told: dict[str, Any]) -> list[str]:
+    """What of a recording a command could not read; `adjust` says it among its notes."""
+    sign = "damaged recording: "
+    noted = [note.removeprefix(sign) for note in told.get("notes") or () if note.startswith(sign)]
+    return told.get("damage") or noted
+
+
 def _told(plan: Plan, name: str) -> dict[str, Any]:
     """What a command said of its result."""
     try:
@@ -112,7 +121,7 @@ def write_tables(out: Path, result: dict[str, Any]) -> None:
     for row in result["flights"]:
         light, rmse, adjusted = row["light"] or {}, row["rmse_m"] or (None,) * 3, row["adjust"] or {}
         cells = {
-            **row, **{name: light.get(name) for name in LIGHTS},
+            **row, "damage": "; ".join(row["damage"]) or None, **{name: light.get(name) for name in LIGHTS},
             "rmse_X_m": rmse[0], "rmse_Y_m": rmse[1], "rmse_Z_m": rmse[2],
             "adjust_sigma0": adjusted.get("sigma0"), "adjust_rejected": adjusted.get("rejected"),
         }  # fmt: skip
@@ -143,6 +152,8 @@ def table_lines(rows: Sequence[dict[str, Any]], every: bool = False) -> list[str
             f"{_number(row['sigma0'], 3):>6}  {_number(row['nees'], 2):>5}  {light_words(row['light']):>16}  {rmse}"
             + (" m" if row["rmse_m"] else "")
         )
+        if row["damage"]:
+            lines.append(f"{'':<{width}}  damaged recording: {'; '.join(row['damage'])}")
     if len(shown) < len(rows):
         lines.append(f"... and {len(rows) - len(shown)} more, in summary.csv (-v prints all)")
     return lines

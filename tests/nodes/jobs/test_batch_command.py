@@ -153,6 +153,22 @@ def test_a_failure_is_named_with_its_reason_and_log_and_stops_nothing_else(seaso
     assert 'href="day1/broken/adjust.log"' in Path("out/index.html").read_text()
 
 
+@pytest.mark.parametrize("steps", ["adjust", "process,analyze"])
+def test_a_recording_that_is_cut_off_is_told(season, steps, capsys):
+    """It stood there as any other flight."""
+    whole = Path("season/day1/f2.mcap").read_bytes()
+    Path("season/day1/f2.mcap").unlink()
+    Path("season/day1/f2.mcap").write_bytes(whole[: -len(whole) // 20])
+    assert main(["batch", "season/day1", "-o", "out", "--do", steps, "--workers", "2"]) == 0
+    told = "the file ends inside a record at byte"
+    out = capsys.readouterr().out
+    assert out.count("damaged recording: ") == 1 and told in out
+    good, cut = summary()["flights"]
+    assert good["damage"] == [] and told in cut["damage"][0] and cut["state"] == "finished"
+    assert told in Path("out/summary.csv").read_text().splitlines()[2]
+    assert told in Path("out/index.html").read_text()
+
+
 def test_a_step_whose_input_failed_is_not_begun(season, capsys):
     Path("none.mcap").write_bytes(b"no recording")
     assert main(["batch", "none.mcap", "-o", "out", "--do", "process,analyze,adjust"]) == 1
