@@ -197,7 +197,8 @@ def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Ite
     UserError : the recording does not hold it, or no strip
     """
     name, orientation, reference_ns = orientation_of(recording, name)
-    strips = recording.last_strips()
+    # nodes use no strip without a rate
+    strips = {id: strip for id, strip in recording.last_strips().items() if strip.line_rate_hz > 0}
     if not strips:
         raise UserError(f"{recording.reader.path}: no strip in it, so no lines (configuration/strip)")
     stated = name in REFINED and orientation.has_covariance
@@ -219,7 +220,8 @@ def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Ite
 
 
 def _line_stamps(recording: Recording, strip: Any) -> NDArray[np.int64]:
-    """UTC of the lines of a strip, ns: of its image lines where it has some, which know them best."""
+    """UTC of the lines of a strip, ns: of its image lines where it has some, which know them best; where the number of
+    its lines is not known, as of a strip whose end was not recorded, of those under its poses."""
     for topic in sorted({c.topic for c in recording.reader.channels.values() if c.topic.startswith("sensor/lines/")}):
         stamps: dict[int, NDArray[np.int64]] = {}
         for message in recording.messages(topic):
@@ -231,7 +233,14 @@ def _line_stamps(recording: Recording, strip: Any) -> NDArray[np.int64]:
             for first, times in stamps.items():
                 found[first : first + len(times)] = times
             return found
-    return _regular(strip, int(strip.lines))
+    return _regular(strip, int(strip.lines) or _under_poses(recording, strip))
+
+
+def _under_poses(recording: Recording, strip: Any) -> int:
+    """Number of lines of a strip up to the last pose that names it; 0 where none does."""
+    tables = [recording.poses(ORIENTATIONS[name]) for name in REFINED]
+    since_ns = np.concatenate([p.time_ns[p.strip == strip.id] for p in tables]) - int(strip.first_line_time_ns)
+    return max(int(since_ns.max(initial=-1) * 1e-9 * strip.line_rate_hz + 1e-6) + 1, 0) if len(since_ns) else 0
 
 
 def _regular(strip: Any, lines: int) -> NDArray[np.int64]:

@@ -406,6 +406,28 @@ def test_what_is_refined_again_takes_the_place_of_what_was_said_before(refined_t
     assert np.diff(records[:, 0]) == pytest.approx([0.2, 0.2, 0.7, 0.2], abs=1e-6)
 
 
+def test_lines_of_a_strip_whose_end_was_not_recorded_are_those_under_its_poses(tmp_path, capsys):
+    """Drivers say how many lines a strip has when it ends; there were none, without a word."""
+    messages = [_project(), Message("configuration/camera", START, camera_message(preset("ads40-small")), "test")]
+    for id, first, rate in (("S1", 0, 100.0), ("S2", 20, 50.0), ("no rate", 30, 0.0)):
+        strip = m.Strip(id=id, first_line_time_ns=START + first * 10**8, line_rate_hz=rate)
+        messages.append(Message("configuration/strip", START, strip, "camera"))
+    for i in range(40):  # the turn between strips, too
+        t = START + i * 10**8
+        pose = [10.0 * i, 5.0, 1000.0], [0.0, 0.0, 0.0], np.eye(6)
+        messages.append(Message("trajectory/smoothed", t, pose_message(t, *pose), "navigator"))
+        if i < 10 or 20 <= i < 26:
+            strip = "S1" if i < 10 else "S2"
+            messages.append(Message("orientation/final", t, pose_message(t, *pose, strip=strip), "adjuster"))
+    path, table = write_recording(tmp_path / "flight.mcap", messages), tmp_path / "lines.csv"
+    assert main(["export", str(path), "--per-line", str(table)]) == 0
+    assert "final orientation, 117 lines" in capsys.readouterr().out
+    rows = [line.split(",")[:3] for line in table.read_text().splitlines()[1:]]
+    assert [row[0] for row in rows] == ["S1"] * 91 + ["S2"] * 26
+    last_s = (START + 25 * 10**8) / 1e9
+    assert rows[-1][1] == "25" and float(rows[-1][2]) == pytest.approx(last_s, abs=1e-6)
+
+
 def test_configuration_that_is_stated_again_counts(tmp_path):
     """As for the nodes, which begin anew with it."""
     again = m.Project(name="p", crs="local", origin_latitude=48.5, origin_longitude=10.6)
