@@ -201,12 +201,17 @@ class Flight:
         return np.where([point in self.refused_ground or axis in out for axis in "XYZ"], np.nan, xyz)
 
     def strip_times(self, strip: str) -> tuple[int, int] | None:
-        """First and last line of a strip, UTC ns; None where the number of lines is not known."""
+        """First and last line of a strip, UTC ns; up to the last pose that names it where the number of lines is not
+        known, as of a strip whose end was not recorded. None where there is none."""
         message = self.strips.get(strip)
-        if message is None or not message.lines or not message.line_rate_hz > 0:
+        if message is None or not message.line_rate_hz > 0:
             return None
-        length = int((message.lines - 1) / message.line_rate_hz * SECOND_NS)
-        return message.first_line_time_ns, message.first_line_time_ns + length
+        if message.lines:
+            length = int((message.lines - 1) / message.line_rate_hz * SECOND_NS)
+            return message.first_line_time_ns, message.first_line_time_ns + length
+        named = [poses.time_ns[poses.strip == strip] for poses in self.poses.values()]
+        last = max((int(times[-1]) for times in named if len(times)), default=0)
+        return (message.first_line_time_ns, last) if last > message.first_line_time_ns else None
 
     def during_strips(self, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which times lie on a strip; all of them where no strip is known."""

@@ -24,6 +24,7 @@ from triline.nodes.report.flight import collect
 from triline.nodes.report.page import page
 from triline.nodes.report.source import read
 from triline.nodes.report.style import styled
+from triline.nodes.report.tracks import tracks
 from triline.schemas import messages as m
 
 
@@ -207,6 +208,27 @@ def test_a_flight_that_ended_early_is_named(messages, tmp_path):
     assert f"f{said}" in accuracy_lines(result) and f"F{said}" in page(flight, result)
     flight, held = read(write_recording(tmp_path / "whole.mcap", messages))
     assert analyse(flight, held)["ended_early"] == []
+
+
+def test_a_strip_whose_end_was_not_recorded_counts(messages):
+    """Drivers say how many lines a strip has when it ends: up to then it was on no map and under no light."""
+    cut, ended = [], None
+    for x in messages:
+        if x.topic == "configuration/strip":
+            body = type(x.body).FromString(x.body.SerializeToString())
+            ended = m.Strip(id="S0", first_line_time_ns=body.first_line_time_ns - 10 * 10**9, lines=100, ended=True)
+            ended.line_rate_hz = body.line_rate_hz  # one before, whose number of lines is known
+            cut.append(replace(x, body=ended))
+            body.lines, body.ended = 0, False
+            x = replace(x, body=body)
+        cut.append(x)
+    whole, found = collect(messages), collect(cut)
+    first, last = whole.strip_times("S1")
+    assert found.strip_times("S1")[0] == first and abs(found.strip_times("S1")[1] - last) < 10**8
+    assert [track["strip"] for track in tracks(found)] == ["S1"]
+    result, wanted = (evaluate_flight(flight)["orientation"]["final"]["n"] for flight in (found, whole))
+    assert abs(result - wanted) <= 1
+    assert evaluate_flight(found)["ended_early"] == []
 
 
 @pytest.mark.parametrize(("field", "value"), [("line_rate_hz", 0.0), ("first_line_time_ns", 10**15), ("lines", 2**31)])
