@@ -223,14 +223,14 @@ class RecordingReader:
                 self.library = record.library
             case Metadata(name=name, metadata=entries) if name == CHANNEL_METADATA:
                 number = entries.get("id", "")
-                self._add_channel(int(number) if number.isdigit() else 0, entries.get("topic", ""), None, entries, 1)
+                self._add_channel(int(number) if number.isdigit() else 0, entries.get("topic", ""), None, entries, 0)
             case DataEnd():
                 self._data_end = found.offset, record.data_section_crc
             case Footer():
                 self.complete = self._buffer[found.end : found.end + len(scan.MAGIC)] == scan.MAGIC
                 self._check_summary(record, found.end)
             case _:
-                self._define(record, 0)
+                self._define(record, 1)
 
     def _note_content(self, content: memoryview, rows: array[int]) -> None:
         """Note what stands in a chunk: messages, and what defines their channels.
@@ -272,7 +272,8 @@ class RecordingReader:
     def _define(self, record: McapRecord, trust: int) -> None:
         """Note a schema or a channel.
 
-        A chunk's checksum vouches for what is defined inside (``trust`` 2); what is repeated outside only fills in.
+        A chunk's checksum vouches for what is defined inside (``trust`` 2); what stands outside (1) only fills in, and
+        metadata that repeat a channel (0) where it is lost: other programs keep them and number channels anew.
         """
         if isinstance(record, Schema):
             if trust >= self._schemas.get(record.id, (0, ""))[0]:
@@ -292,8 +293,7 @@ class RecordingReader:
         except KeyError:
             wanted = None
         type_name = wanted if type_name is None else type_name
-        if metadata.get("copy"):
-            self._copies.add(number)
+        (self._copies.add if metadata.get("copy") else self._copies.discard)(number)
         start, every = (metadata.get(name, "") for name in ("start", "every"))
         self.channels[number] = Channel(
             number, topic, type_name or "", metadata.get("source", ""), metadata.get("platform", ""),

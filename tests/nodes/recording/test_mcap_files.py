@@ -121,6 +121,34 @@ def test_a_recording_of_an_earlier_version_is_read_like_the_library_reads_it():
     assert ours == theirs and len(ours) == len(reader.index)
 
 
+@pytest.mark.parametrize("chunked", [True, False])
+def test_a_program_that_numbers_channels_anew_and_keeps_metadata_mixes_up_no_topics(tmp_path, chunked):
+    """Metadata repeat the channels of a recording; their numbers counted more than the channels themselves."""
+    ours, theirs = write_recording(tmp_path / "ours.mcap", sample.flight()), tmp_path / "theirs.mcap"
+    with open(ours, "rb") as source, open(theirs, "wb") as target:
+        reader, writer = make_reader(source), Writer(target, use_chunking=chunked)
+        writer.start()
+        for kept in reader.iter_metadata():
+            writer.add_metadata(kept.name, kept.metadata)
+        for i in range(6):  # of another program
+            writer.register_channel(f"/other/{i}", "json", 0)
+        schemas, channels = {}, {}
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            if channel.id not in channels:
+                if schema.id not in schemas:
+                    schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, schemas[schema.id], channel.metadata
+                )
+            to = channels[channel.id]
+            writer.add_message(to, message.log_time, message.data, message.publish_time, message.sequence)
+        writer.finish()
+    told = [[(raw.topic, raw.envelope, bytes(raw.data)) for raw in r.raws(r.sort(r.select()))]
+            for r in (RecordingReader(ours), RecordingReader(theirs))]  # fmt: skip
+    assert told[0] == told[1]
+    assert findings(RecordingReader(theirs)) == []
+
+
 def test_views_of_a_file_are_not_copies(tmp_path):
     path = write_recording(tmp_path / "a.mcap", [sample.message("sensor/gnss")])
     reader = RecordingReader(path)
