@@ -40,7 +40,7 @@ class PlayResult:
     Attributes
     ----------
     counts : messages by topic
-    left_out : recorded messages by topic that nodes make anew
+    left_out : recorded messages by topic, of the part that was played, that nodes make anew
     rounds : how often
     worst_late_s, mean_late_s : how late messages were put on the bus, s
     """
@@ -104,7 +104,12 @@ def play(
     numbers = reader.select()
     channel = reader.index.channel[numbers]
     left = np.isin(channel, list(leave_out))
-    for id, count in zip(*np.unique(channel[left], return_counts=True), strict=True):
+    asked = np.ones(len(numbers), dtype=bool)
+    if from_ns is not None:
+        asked &= reader.index.stamp_ns[numbers] >= from_ns
+    if to_ns is not None:
+        asked &= reader.index.stamp_ns[numbers] <= to_ns
+    for id, count in zip(*np.unique(channel[left & asked], return_counts=True), strict=True):
         result.left_out[reader.channels[int(id)].topic] += int(count)
     before, body = _split(reader, numbers[~left], from_ns, to_ns)
     head, told = _holding(reader, before, body)

@@ -328,6 +328,10 @@ def test_replay_leaves_out_what_nodes_make_anew(tmp_path):
     reader = RecordingReader(write_recording(tmp_path / "a.mcap", messages))
     result = play(reader, lambda raw: None, threading.Event(), rate=0, settle_s=0.0)
     assert result.left_out == {"trajectory/filtered": 5, "status/navigator": 1}
+    stamps = sorted(x.stamp_ns for x in messages if x.topic == "trajectory/filtered")
+    part = {"from_ns": stamps[1], "to_ns": stamps[3]}  # and no others than of that part are counted
+    result = play(reader, lambda raw: None, threading.Event(), rate=0, settle_s=0.0, **part)
+    assert result.left_out["trajectory/filtered"] == 3
     # a trajectory that nobody can make anew is an input
     reader = RecordingReader(write_recording(tmp_path / "b.mcap", messages[-6:-1]))
     assert play(reader, lambda raw: None, threading.Event(), rate=0, settle_s=0.0).counts == {"trajectory/filtered": 5}
