@@ -222,17 +222,15 @@ def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Ite
 def _line_stamps(recording: Recording, strip: Any) -> NDArray[np.int64]:
     """UTC of the lines of a strip, ns: of its image lines where it has some, which know them best; where the number of
     its lines is not known, as of a strip whose end was not recorded, of those under its poses."""
+    blocks: list[tuple[int, NDArray[np.int64]]] = []
     for topic in sorted({c.topic for c in recording.reader.channels.values() if c.topic.startswith("sensor/lines/")}):
-        stamps: dict[int, NDArray[np.int64]] = {}
-        for message in recording.messages(topic):
-            if message.body.strip == strip.id:
-                stamps[int(message.body.first_line)] = message.body.times_ns()
-        if stamps:
-            total = max(first + len(times) for first, times in stamps.items())
-            found = _regular(strip, total)
-            for first, times in stamps.items():
-                found[first : first + len(times)] = times
-            return found
+        own = (message.body for message in recording.messages(topic) if message.body.strip == strip.id)
+        blocks += [(int(body.first_line), body.times_ns()) for body in own]
+    if blocks:
+        found = _regular(strip, max(first + len(times) for first, times in blocks))
+        for first, times in reversed(blocks):  # those of the first CCD line count, where it has the line
+            found[first : first + len(times)] = times
+        return found
     return _regular(strip, int(strip.lines) or _under_poses(recording, strip))
 
 

@@ -428,6 +428,28 @@ def test_lines_of_a_strip_whose_end_was_not_recorded_are_those_under_its_poses(t
     assert rows[-1][1] == "25" and float(rows[-1][2]) == pytest.approx(last_s, abs=1e-6)
 
 
+def test_lines_that_one_ccd_line_has_lost_are_there_for_the_others(tmp_path, capsys):
+    """The table ended where the first CCD line did."""
+    messages = [_project(), Message("configuration/camera", START, camera_message(preset("ads40-small")), "test")]
+    strip = m.Strip(id="S1", first_line_time_ns=START, line_rate_hz=100.0, lines=200)
+    messages.append(Message("configuration/strip", START, strip, "camera"))
+    for i in range(21):
+        t = START + i * 10**8
+        pose = pose_message(t, [10.0 * i, 5.0, 1000.0], [0.0, 0.0, 0.0])
+        messages.append(Message("truth/trajectory", t, pose, "simulator"))
+        for ccd, late_ns in (("B", 0), ("F", 1000)):
+            if i < (8 if ccd == "B" else 20):
+                block = LineBlock(np.zeros((10, 5), dtype=np.uint8), ccd, "S1", 10 * i, t + late_ns, 10**7)
+                messages.append(Message(f"sensor/lines/{ccd}", t + 9 * 10**7, block, "camera"))
+    messages.sort(key=lambda message: message.stamp_ns)
+    path, table = write_recording(tmp_path / "flight.mcap", messages), tmp_path / "lines.csv"
+    assert main(["export", str(path), "--per-line", str(table)]) == 0
+    assert "truth orientation, 200 lines" in capsys.readouterr().out
+    times = [line.split(",")[2] for line in table.read_text().splitlines()[1:]]
+    late = [int(time.split(".")[1]) % 10**7 for time in times]
+    assert late == [0] * 80 + [1000] * 120
+
+
 def test_configuration_that_is_stated_again_counts(tmp_path):
     """As for the nodes, which begin anew with it."""
     again = m.Project(name="p", crs="local", origin_latitude=48.5, origin_longitude=10.6)
