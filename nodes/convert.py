@@ -30,6 +30,8 @@ from ..solver.models.slow_errors import SlowErrors
 Array = NDArray[np.floating]
 
 SECOND_NS = 1_000_000_000
+#: A strip has ended when no image line of it has come for so long, s: for the matcher, for sensors, and in bags.
+STRIP_SILENT_S = 5.0
 LOCAL_FRAME_ID = "local"
 #: Times of which ns do not fit into 64 bits, s: of the year 2261. No clock is off by more than a century, s.
 LATEST_S, CENTURY_S = 9.2e9, 3.2e9

@@ -41,6 +41,7 @@ from ..formats.scene_block import ImageEntry, SceneBlockData
 from ..formats.table import write_table
 from .adjustment_result import (
     HOPELESS,
+    MOST_LISTED,
     deserted_note,
     elsewhere,
     failing_note,
@@ -65,8 +66,6 @@ _BEYOND_M = 500.0
 #: Control so many metres from where its rays meet is not where it is stated. Derived: half a degree of attitude from
 #: 830 km up is less.
 _ELSEWHERE_M = 10_000.0
-#: Pairs of correlated unknowns that are listed.
-_MOST_LISTED = 20
 TABLES = ("points.csv", "residuals.csv", "trajectory_refined.csv")
 
 
@@ -514,7 +513,7 @@ def _correlations(a: SceneAdjustment, sigma: Array) -> list[dict[str, Any]]:
     if not len(sigma) or len(sigma) > 1500:
         return []
     pairs = strongest_correlations(a.solution.values_covariance, a.problem.block.layout.names)
-    return [{"between": [p.first, p.second], "r": p.correlation} for p in pairs[:_MOST_LISTED]]
+    return [{"between": [p.first, p.second], "r": p.correlation} for p in pairs[:MOST_LISTED]]
 
 
 def _notes(a: SceneAdjustment) -> list[str]:

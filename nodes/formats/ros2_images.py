@@ -18,15 +18,13 @@ from ...schemas import messages as m
 from ...schemas.image_lines import LineBlock
 from ...schemas.topics import rank
 from ...solver.camera.line_camera import LineCamera
-from ..convert import SECOND_NS
+from ..convert import SECOND_NS, STRIP_SILENT_S
 from ..errors import UserError
 from ..node import Message
 from .image_lines import BLOCK_S, CLOSING_NS, off_the_rate
 from .ros2_decoding import decoded
 
 IMAGE = "sensor_msgs/msg/Image"
-#: A strip has ended when no image of any topic has come for so long, s.
-SILENT_S = 5.0
 #: Line rates of topics that differ by a larger share are not of one camera.
 SAME_RATE = 0.01
 _PIXELS = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
@@ -231,7 +229,7 @@ def _strips(
     begins = sorted((time, time + round(rows * period)) for images in seen.values() for time, rows in images)
     starts, until = [], -np.inf
     for begin, end in begins:
-        if begin - until > SILENT_S * SECOND_NS:
+        if begin - until > STRIP_SILENT_S * SECOND_NS:
             starts.append(begin)
         until = max(until, end)
     strips, missing = [], 0

@@ -7,10 +7,8 @@ from typing import Any
 from ...schemas import messages as m
 from ...schemas.image_lines import LineBlock
 from ...solver.matching.line_times import OTHER_LINES
-from ..convert import SECOND_NS
+from ..convert import SECOND_NS, STRIP_SILENT_S
 
-#: A strip has ended when no line of it has come for so long, ns of platform time.
-SILENT_NS = 5 * SECOND_NS
 #: Lines without times of their own that are off the rate of their strip by more are told, lines; then its tie points
 #: are worse than their sigma, also where the strip was announced, with a nominal rate.
 OFF_LINES = 0.5
@@ -107,7 +105,7 @@ class FoundStrips:
 
     def ended(self, stamp_ns: int, block: LineBlock | None = None) -> list[Any]:
         """Strips that have ended: another one has lines now, or there have been none for a while."""
-        silent = [id for id, newest_ns in self._newest_ns.items() if stamp_ns - newest_ns > SILENT_NS]
+        silent = [id for id, newest_ns in self._newest_ns.items() if stamp_ns - newest_ns > STRIP_SILENT_S * SECOND_NS]
         self._silent.update(silent)
         others = [] if block is None else [id for id in self._newest_ns if id != block.strip]
         return [self._end(id) for id in dict.fromkeys((*silent, *others))]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ...schemas.image_lines import LineBlock
 from ...solver.camera.line_camera import LineCamera
-from ..convert import SECOND_NS
+from ..convert import SECOND_NS, STRIP_SILENT_S
 from ..errors import UserError
 from ..formats.envi import header_integer, header_of, read_header
 from ..formats.envi_image import TYPES
@@ -24,7 +24,7 @@ from ..formats.keys import Keys
 from ..formats.time_columns import instant_ns, instants_ns
 from ..node import Message
 from .blocks import BLOCK_S, block_message, pixels_of, strip_message
-from .program import LOOK_S, SILENT_S, Clock, Sensor, publish, refuse_unknown
+from .program import LOOK_S, Clock, Sensor, publish, refuse_unknown
 
 if TYPE_CHECKING:
     from ..bus.program import ProgramOptions
@@ -433,11 +433,11 @@ class Silence:
         self._begun: float | None = None
 
     def long(self) -> bool:
-        """Whether nothing has come for `SILENT_S`; true once."""
+        """Whether nothing has come for `STRIP_SILENT_S`; true once."""
         now = time.monotonic()
         if self._begun is None:
             self._begun = now
-        if now - self._begun > SILENT_S:
+        if now - self._begun > STRIP_SILENT_S:
             self._begun = float("inf")
             return True
         return False

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 COMMON = ("id", "kind", "clock_offset_s", "delay_s", "imu_noise")
 #: Where a program waits for data it looks this often whether it shall end, s.
 LOOK_S = 0.1
-#: A strip has ended when no line has come for so long, s.
-SILENT_S = 5.0
 
 
 @dataclass(frozen=True)

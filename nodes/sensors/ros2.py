@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ...schemas.image_lines import LineBlock
 from ...solver.camera.line_camera import LineCamera
 from ..bus.session import listen_elsewhere
-from ..convert import SECOND_NS, set_time
+from ..convert import SECOND_NS, STRIP_SILENT_S, set_time
 from ..errors import UserError
 from ..formats.keys import Keys
 from ..formats.ros2 import IMU, fix_messages, inertial_messages
@@ -30,7 +30,7 @@ from ..formats.ros2_decoding import FIX
 from ..formats.ros2_images import IMAGE, image_rows, lines_missing, strip_name
 from ..node import Message
 from .blocks import block_message
-from .program import LOOK_S, SILENT_S, Clock, Sensor, noise_of, publish, refuse_unknown
+from .program import LOOK_S, Clock, Sensor, noise_of, publish, refuse_unknown
 
 if TYPE_CHECKING:
     from ..bus.program import ProgramOptions
@@ -120,7 +120,7 @@ class LiveStrips:
     The stamp of an image is the time of its first row. Line 0 is the earliest row of a strip, whichever CCD line it is
     of: what comes first is held back until all topics have begun, or one is `BEGIN_S` ahead. Rows of a topic count on
     from image to image, over images that are lost as well. A topic that begins later, or begins anew, takes its number
-    from the others. When no topic has brought an image for `SILENT_S` the next one begins another strip, which is named
+    from the others. When no topic has brought an image for `STRIP_SILENT_S` the next one begins another strip, named
     by the time of its first line.
 
     Where the camera keeps another rate than the nominal one, its lines get times of their own, by a straight line
@@ -158,7 +158,7 @@ class LiveStrips:
         pixels : rows (n, samples)
         """
         begin_ns = round(BEGIN_S * SECOND_NS)
-        silent = not self._next or time_ns - max(self._next.values())[0] > SILENT_S * SECOND_NS
+        silent = not self._next or time_ns - max(self._next.values())[0] > STRIP_SILENT_S * SECOND_NS
         if not (silent or (self._held and time_ns > self._held[0].time_ns - begin_ns)):
             return self._numbered(_Image(ccd, time_ns, pixels))
         self._held.append(_Image(ccd, time_ns, pixels))

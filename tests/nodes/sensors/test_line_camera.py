@@ -106,7 +106,7 @@ def test_a_second_band_of_a_raw_file_is_refused(tmp_path):
 
 def test_a_strip_that_goes_on_after_its_end_gets_another_name(tmp_path, monkeypatch):
     """Under the same name it was announced twice, and nodes that had ended it refused all that came then."""
-    monkeypatch.setattr("triline.nodes.sensors.line_camera.SILENT_S", 0.3)
+    monkeypatch.setattr("triline.nodes.sensors.line_camera.STRIP_SILENT_S", 0.3)
     for ccd, band, n in (("F", 0, 20), ("N", 1, 18)):  # the one is two lines behind
         (tmp_path / f"{ccd}.raw").write_bytes(IMAGE[:n, band].tobytes())
     sensor = LineFiles(settings(tmp_path, images={"F": "F.raw", "N": "N.raw"}, first_time=START))
