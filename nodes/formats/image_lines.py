@@ -22,7 +22,7 @@ from ..node import Message
 from .envi import header_of
 from .envi_image import TYPES, open_envi, open_raw
 from .grey_image import GreyImage, ImageFile
-from .table import Column, column_names_of, read_table
+from .table import Column, column_names_of, read_table, separator_hint
 from .tiff_image import is_tiff, open_tiff
 from .time_columns import WANTED, instant_ns, time_columns, times_of
 
@@ -309,9 +309,10 @@ def line_times(path: Path, day: date | None, notes: list[str]) -> NDArray[np.int
     """
     if not path.is_file():
         raise UserError(f"{path}: no such file, wanted a CSV with line and time")
-    columns = time_columns(column_names_of(path))
+    header = column_names_of(path)
+    columns = time_columns(header)
     if not columns:
-        raise UserError(f"{path}:1: time: column missing, wanted line and {WANTED}")
+        raise UserError(f"{path}:1: time: column missing, wanted line and {WANTED}{separator_hint(header)}")
     table = read_table(path, [Column("line", "integer", low=0), *columns], notes)
     line = table["line"]
     table.refuse(line != np.arange(len(line)), "line", lambda i: f"{line[i]:.0f}, wanted {i} (0, 1, 2, ...)")

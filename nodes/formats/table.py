@@ -295,11 +295,15 @@ def _header(path: Path, columns: Sequence[Column], notes: list[str]) -> list[str
             raise UserError(f"{path}:1: {twice[1]}: this column comes twice, also as {twice[0]}")
     missing = [column.name for column in columns if not column.optional and not set(column.names) & set(header)]
     if missing:
-        hint = "; is the separator a comma?" if len(header) == 1 and any(c in header[0] for c in "\t ") else ""
-        raise UserError(f"{path}:1: {missing[0]}: column missing, wanted {_names(columns)}{hint}")
+        raise UserError(f"{path}:1: {missing[0]}: column missing, wanted {_names(columns)}{separator_hint(header)}")
     ignored = dict.fromkeys(name for name in header if name not in known)
     notes.extend(f"{path.name}: column {name!r} is not known and was ignored" for name in ignored)
     return header
+
+
+def separator_hint(header: Sequence[str]) -> str:
+    """What may be wrong with a header in which a column is missing; "" where that is nothing else."""
+    return "; is the separator a comma?" if len(header) == 1 and any(c in header[0] for c in "\t ") else ""
 
 
 def _names(columns: Sequence[Column]) -> str:

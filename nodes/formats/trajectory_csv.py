@@ -15,7 +15,7 @@ from ..errors import UserError
 from .place_columns import PLACE, check_place_units, place_column
 from .plausible import check_units
 from .projection import refuse_missing_grids
-from .table import Column, Table, column_names_of, read_table
+from .table import Column, Table, column_names_of, read_table, separator_hint
 from .time_columns import WANTED, time_columns, times_of
 from .track import NavigationTrack, checked
 
@@ -75,7 +75,7 @@ def read_trajectory_csv(path: Path, crs: str | None = None, day: date | None = N
     header = column_names_of(path)
     time = time_columns(header)
     if not time:
-        raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}")
+        raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}{separator_hint(header)}")
     photogrammetric = _is_photogrammetric(header)
     names = {} if photogrammetric else _columns(path, header)
     wanted = _PHOTOGRAMMETRIC if photogrammetric else tuple(Column(name) for name in names.values())
@@ -118,9 +118,10 @@ def read_local_poses(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     UserError : ``file:line: column: what is wrong``, two poses at one time
     """
     notes: list[str] = []
-    time = time_columns(column_names_of(path))
+    header = column_names_of(path)
+    time = time_columns(header)
     if not time:
-        raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}")
+        raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}{separator_hint(header)}")
     table = read_table(path, [*time, *(Column(column.name) for column in _PHOTOGRAMMETRIC)], notes)
     time_ns, first, of = np.unique(times_of(table, time, None, notes), return_index=True, return_inverse=True)
     if len(time_ns) < 2:

@@ -163,6 +163,16 @@ def test_empty_columns_and_others_that_come_twice_are_ignored(tmp_path):
         read_track(path, "csv", Options())
 
 
+def test_tabs_are_told(tmp_path):
+    """Of poses and line times it was said that the column of the time is missing, which stood there."""
+    poses = write(tmp_path / "p.csv", "time_s", [f"{1591012800 + i}.0" for i in range(N)], sep="\t")
+    times = tmp_path / "times.csv"
+    times.write_text("line\ttime_s\n0\t1591012800.5\n1\t1591012800.75\n")
+    for read in (lambda: read_track(poses, "csv", Options()), lambda: line_times(times, None, [])):
+        with pytest.raises(UserError, match=r":1: .*column missing, .*; is the separator a comma\?"):
+            read()
+
+
 def test_times_in_words_with_decimal_commas(tmp_path):
     """ISO 8601 has them, and tables with decimal commas."""
     rows = [
