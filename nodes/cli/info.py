@@ -103,7 +103,8 @@ def _lines(s: dict[str, Any]) -> list[str]:
     for strip in s.get("strips", ()):
         ended = "" if strip["ended"] else ", not ended"
         rate = f"{strip['line_rate_hz']:.1f} Hz"
-        lines.append(f"strip {strip['id']}: from {strip['start']}, {strip['lines']} lines at {rate}{ended}")
+        number = f"{strip['lines']} lines" if strip["lines"] else "lines"  # drivers say how many when a strip ends
+        lines.append(f"strip {strip['id']}: from {strip['start']}, {number} at {rate}{ended}")
     if "world" in s:
         lines.append(f"true world, not stated: {s['world']}")
     lines.append(f"{'topic':<24} {'messages':>9} {'rate':>9}  {'gaps':>5}  source")

@@ -66,6 +66,14 @@ def test_info(capsys, flight):
     assert summary["damage"] == [] and summary["duration_s"] == pytest.approx(2.995)
 
 
+def test_a_strip_that_has_not_ended_has_no_number_of_lines(capsys, tmp_path):
+    """Drivers say it at the end; it had "0 lines"."""
+    strip = m.Strip(id="S1", first_line_time_ns=sample.EPOCH_NS, line_rate_hz=200.0)
+    path = write_recording(tmp_path / "cut.mcap", [Message("configuration/strip", sample.EPOCH_NS, strip, "test", 0)])
+    code, out, _ = run(capsys, "info", path)
+    assert code == 0 and ", lines at 200.0 Hz, not ended" in out
+
+
 def test_check(capsys, flight, tmp_path):
     assert run(capsys, "check", flight)[0] == 0
     data = flight.read_bytes()
