@@ -119,7 +119,7 @@ class Fine:
 
 
 def test_pixels_far_from_each_other_take_small_windows_of_a_fine_raster():
-    """The edge of an image took a window as large as the image: 9 GB of 20 000 x 20 000 values."""
+    """The edge of an image took a window as large as the image: 2.3 GB of 11 000 x 11 000 values."""
     model, fine = frame_camera(), Fine()
     line, sample = (a.ravel() for a in np.mgrid[0 : model.lines - 1 : 5j, 0 : model.samples - 1 : 5j])
     met = meet_terrain(model, line, sample, fine, 490.0, 510.0)
