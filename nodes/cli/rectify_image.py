@@ -208,6 +208,8 @@ def _check(args: argparse.Namespace) -> None:
         raise UserError(f"--height {args.height}: wanted a number")
     if args.dem and args.height is not None:
         raise UserError("--height and --dem: wanted one of them")
+    if args.occlusions and not args.dem:
+        raise UserError("--occlusions: goes with --dem, without which no ground is higher than another")
     if args.correction is not None and args.control is None:
         raise UserError(f"--correction {args.correction}: goes with --control CSV, whose points it is found by")
     if args.direct and (args.sigma or args.occlusions):

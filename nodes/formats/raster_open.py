@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..errors import UserError
 
 #: Values that mean that no height is known, in rasters that do not say which does; so do those beyond `_NO_HEIGHT`.
-_VOIDS, _NO_HEIGHT = (-9999.0, -32767.0, -32768.0), 1e30
+_VOIDS, _NO_HEIGHT = (-9999.0, -32767.0, -32768.0, -99999.0), 1e30
 #: Units of heights that count as metres.
 _METRES = ("", "m", "metre", "meter", "metres", "meters")
 

@@ -789,6 +789,7 @@ def test_heights_are_refused_without_a_datum_elsewhere_and_of_another_planet(sce
     (tmp_path / "text.tif").write_text("heights")
     assert "not a raster" in refused(capsys, *base, tmp_path / "text.tif", "--dem-datum", "0")
     assert "goes with --dem" in refused(capsys, *base[:-1], "--dem-datum", "0")
+    assert "--occlusions: goes with --dem" in refused(capsys, *base[:-1], "--height", "0", "--occlusions")
     assert not (tmp_path / "o.tif").exists()
 
 

@@ -531,7 +531,7 @@ def test_heights_are_those_that_the_raster_states(tmp_path):
     assert height == pytest.approx(place[:, 2], abs=1e-3)
 
 
-@pytest.mark.parametrize("void", [-9999.0, -32767.0, -32768.0, float(np.finfo(np.float32).min)])
+@pytest.mark.parametrize("void", [-9999.0, -32767.0, -32768.0, -99999.0, float(np.finfo(np.float32).min)])
 @pytest.mark.parametrize("stated", [True, False])
 def test_voids_are_no_heights_also_where_the_raster_does_not_say_so(tmp_path, void, stated):
     path, z = tmp_path / "void.tif", np.full((1, 4, 5), 450.0, dtype=np.float32)
