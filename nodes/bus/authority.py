@@ -74,6 +74,8 @@ class Certified:
     port : on which the platform meets, or the router listens
     revoked : day, "" if not
     routers : the routers that it calls, ``host:port``
+    common : name in its certificate, by which access lists know it: another one than in any certificate that was
+        revoked before under its name; "" is its name
     """
 
     name: str
@@ -84,6 +86,12 @@ class Certified:
     port: int = SECURE_PORT
     revoked: str = ""
     routers: list[str] = field(default_factory=list)
+    common: str = ""
+
+    @property
+    def common_name(self) -> str:
+        """Name in its certificate."""
+        return self.common or self.name
 
 
 class Authority:
@@ -186,7 +194,9 @@ class Authority:
         if name == self.name or any(member.name == name and not member.revoked for member in self.members):
             raise UserError(f"{name}: this name is taken in {self.folder}; revoke it first, or choose another")
         key = ec.generate_private_key(ec.SECP256R1())
-        subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+        earlier = sum(member.name == name for member in self.members)  # all of them revoked
+        common = f"{name}.{earlier + 1}" if earlier else name  # access lists know nothing else of a certificate
+        subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
         listens = ["127.0.0.1", "localhost", *(hosts if kind != DESK else [])]
         use = x509.KeyUsage(
             digital_signature=True, content_commitment=False, key_encipherment=False, data_encipherment=False,
@@ -209,8 +219,8 @@ class Authority:
         (bundle / CERTIFICATE).write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
         (bundle / AUTHORITY).write_bytes((self.folder / CERTIFICATE).read_bytes())
         until = certificate.not_valid_after_utc.date().isoformat()
-        self.members = [member for member in self.members if member.name != name or member.revoked]
-        self.members.append(Certified(name, kind, f"{certificate.serial_number:x}", until, hosts, port, "", called))
+        serial = f"{certificate.serial_number:x}"
+        self.members.append(Certified(name, kind, serial, until, hosts, port, "", called, common if earlier else ""))
         self._save()
         return bundle
 
@@ -264,7 +274,7 @@ class Authority:
             if other.kind == AIRCRAFT:
                 id = f"aircraft-{other.name}"
                 rules.append(_rule(id, "ingress", _MESSAGES, [f"triline/{other.name}/**"]))
-                subjects.append({"id": id, "cert_common_names": [other.name]})
+                subjects.append({"id": id, "cert_common_names": [other.common_name]})
                 policies.append({"rules": [id], "subjects": [id]})
         self._let_desks(rules, subjects, policies)
         if member.kind == DESK and member.routers:
@@ -273,7 +283,7 @@ class Authority:
 
     def _let_routers(self, rules: list[Any], subjects: list[Any], policies: list[Any], *more: str) -> None:
         """Let routers say what they have let in."""
-        routers = [member.name for member in self.valid if member.kind == ROUTER]
+        routers = [member.common_name for member in self.valid if member.kind == ROUTER]
         if routers:
             rules.append(_rule("routers", "ingress", _MESSAGES, ["triline/**"]))
             subjects.append({"id": "routers", "cert_common_names": routers})
@@ -281,7 +291,7 @@ class Authority:
 
     def _let_desks(self, rules: list[Any], subjects: list[Any], policies: list[Any]) -> None:
         """Let desks read, and say what desks say."""
-        desks = [member.name for member in self.valid if member.kind == DESK]
+        desks = [member.common_name for member in self.valid if member.kind == DESK]
         if desks:
             rules.append(_rule("desk-reads", "ingress", _READING, ["triline/**"]))
             rules.append(_rule("desk-says", "ingress", ("put",), [f"triline/*/{topic}" for topic in DESK_TOPICS]))
@@ -303,7 +313,7 @@ class Authority:
             if member.kind == AIRCRAFT:
                 id, own = f"aircraft-{member.name}", [f"triline/{member.name}/**"]
                 rules += [_rule(id, "ingress", _MESSAGES, own), _rule(f"{id}-hears", "egress", _SAYING, own)]
-                subjects.append({"id": id, "cert_common_names": [member.name]})
+                subjects.append({"id": id, "cert_common_names": [member.common_name]})
                 policies.append({"rules": [id, f"{id}-hears"], "subjects": [id]})
         self._let_routers(rules, subjects, policies, "tells")
         self._let_desks(rules, subjects, policies)
@@ -314,7 +324,7 @@ class Authority:
     def _link_access_list(self, member: Certified) -> dict[str, Any]:
         """What an aircraft takes on its link to the ground: questions, and verdicts."""
         own = f"triline/{member.name}"
-        routers = [other.name for other in self.valid if other.kind == ROUTER]
+        routers = [other.common_name for other in self.valid if other.kind == ROUTER]
         rules = [_rule("out", "egress", _MESSAGES, ["triline/**"])]
         subjects: list[dict[str, Any]] = [{"id": "everybody"}]
         policies = [{"rules": ["out"], "subjects": ["everybody"]}]

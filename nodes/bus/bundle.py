@@ -182,6 +182,7 @@ def load_bundle(folder: Path, now: datetime.datetime | None = None) -> Bundle:
             folder, facts["name"], facts["kind"], facts["authority"], dict(facts["revoked_serials"]), int(facts["port"])
         )
         common = str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
+        wanted = str(facts.get("common") or bundle.name)
         uses = set(certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value)
     except (ValueError, KeyError, TypeError, IndexError, RecursionError, x509.ExtensionNotFound):
         raise UserError(f"{folder}: its files are damaged, wanted a bundle of `triline keys`") from None
@@ -200,7 +201,7 @@ def load_bundle(folder: Path, now: datetime.datetime | None = None) -> Bundle:
             raise UserError(f"{folder}: {whose} is valid from {when} UTC on: is the clock of this machine right?")
     if f"{certificate.serial_number:x}" in bundle.revoked:
         raise UserError(f"{folder}: the certificate of {common!r} was revoked by {bundle.authority!r}")
-    if common != bundle.name or bundle.kind not in (AIRCRAFT, DESK, ROUTER):
+    if common != wanted or bundle.kind not in (AIRCRAFT, DESK, ROUTER):
         raise UserError(f"{folder}: the certificate is of {common!r}, the bundle of {bundle.kind} {bundle.name!r}")
     if not set(USES) <= uses:
         raise UserError(f"{folder}: the certificate is for other uses, wanted server and client")

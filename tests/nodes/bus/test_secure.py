@@ -267,3 +267,36 @@ def test_nodes_run_with_bundles_and_the_wrong_ones_are_refused_in_a_line(authori
             wait_for(lambda: "navigator" in bus.alive(), 30, "the encrypted navigator")
         told = triline("node", "navigator", "--secure", bundle, "--platform", "aircraft2", "--port", rig.port)
         assert told.returncode == 1 and "is of aircraft 'aircraft1', not of 'aircraft2'" in told.stderr
+
+
+def test_who_is_certified_anew_does_not_let_in_what_was_revoked_under_that_name(authority):
+    """Access lists know the name in a certificate alone: a stolen one must not have that of the one in its place."""
+    stolen = authority.folder.parent / "stolen"
+    shutil.copytree(authority.folder / "ann", stolen)
+    names = []
+    for _ in range(2):
+        authority.revoke("ann")
+        names.append(x509.load_pem_x509_certificate((authority.certify("ann", DESK, []) / CERTIFICATE).read_bytes()))
+    assert [name.subject.rfc4514_string() for name in names] == ["CN=ann.2", "CN=ann.3"]
+    assert load_bundle(authority.folder / "ann").name == "ann"
+    settings = json.loads((authority.folder / "aircraft1" / "zenoh.json5").read_text().partition("\n")[2])
+    let_in = {entry["id"]: entry.get("cert_common_names") for entry in settings["access_control"]["subjects"]}
+    assert let_in["desks"] == ["ann.3"] and let_in["aircraft-aircraft1"] == ["aircraft1"]
+    port, heard = free_port(), []
+    aircraft = load_bundle(authority.folder / "aircraft1")
+    with (
+        Bus("aircraft1", source="node", port=port, secure=aircraft) as node,
+        Bus("aircraft1", source="thief", port=port, secure=load_bundle(stolen)) as thief,
+        Bus("aircraft1", source="ann", port=port, secure=load_bundle(authority.folder / "ann")) as desk,
+    ):
+        node.subscribe("observation/verdict", lambda raw: heard.append(raw.envelope.source))
+        wait_for(lambda: node.peers() == 2, 20, "links")
+
+        def told() -> bool:
+            for bus, source in ((thief, "thief"), (desk, "ann")):
+                bus.publish(Message("observation/verdict", sample.EPOCH_NS, sample.body("observation/verdict"), source))
+            return "ann" in heard
+
+        wait_for(told, 20, "the verdict of the desk")
+        time.sleep(0.5)
+        assert set(heard) == {"ann"}
