@@ -115,6 +115,34 @@ def port_is_held(port: int) -> bool:
     return False
 
 
+def why_no_listening(file: Path, port: int | None = None) -> list[str]:
+    """Where a router cannot listen now, and why: it tries again, without a word.
+
+    Parameters
+    ----------
+    file, port : as of `routing`
+    """
+    told = []
+    for endpoint in _router_endpoints(configuration(file=file), port):
+        found = re.fullmatch(r"\w+/\[?([^\]]+?)\]?:(\d+)", endpoint)
+        if found is None:
+            continue
+        try:
+            family, _, _, _, address = socket.getaddrinfo(found[1], int(found[2]), type=socket.SOCK_STREAM)[0]
+            with socket.socket(family) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was just given up is free
+                probe.bind(address)
+        except OSError as error:
+            told.append(f"{found[1]}:{found[2]}: {(error.strerror or str(error)).lower()}")
+    return told
+
+
+def _router_endpoints(config: zenoh.Config, port: int | None) -> list[str]:
+    """Where a router listens by its configuration, or on another port."""
+    endpoints = json.loads(config.get_json("listen/endpoints"))
+    return endpoints if port is None else [re.sub(r":\d+$", f":{port}", endpoint) for endpoint in endpoints]
+
+
 class Bus:
     """A session on the bus of one platform.
 
@@ -676,11 +704,7 @@ def routing(file: Path, port: int | None = None) -> Iterator[Callable[[], int]]:
     config = configuration(file=file)
     if json.loads(config.get_json("mode")) != "router":
         raise UserError(f"{file}: not the configuration of a router")
-    if port is not None:
-        listen = [
-            re.sub(r":\d+$", f":{port}", endpoint) for endpoint in json.loads(config.get_json("listen/endpoints"))
-        ]
-        config.insert_json5("listen/endpoints", json.dumps(listen))
+    config.insert_json5("listen/endpoints", json.dumps(_router_endpoints(config, port)))
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
@@ -690,9 +714,12 @@ def routing(file: Path, port: int | None = None) -> Iterator[Callable[[], int]]:
         with query:
             query.reply(query.key_expr, b"", attachment=pack(Envelope(0, "router", 0)))
 
-    with session:
-        session.declare_queryable(topics.key_expression("*", f"query/{LINK}"), zenoh.handlers.Callback(here))
-        yield lambda: len(session.info.peers_zid()) + len(session.info.routers_zid())
+    session.declare_queryable(topics.key_expression("*", f"query/{LINK}"), zenoh.handlers.Callback(here))
+    try:
+        yield lambda: len(session.info.transports())  # aircraft and desks are clients
+    finally:
+        with contextlib.suppress(zenoh.ZError):  # where it has not come to listen, the time to close is over
+            session.close()
 
 
 def _parameters(text: str) -> list[tuple[str, str]]:

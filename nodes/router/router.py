@@ -32,7 +32,7 @@ from ..bus.downlink import (
     share_of,
 )
 from ..bus.program import ProgramOptions
-from ..bus.session import LINK, Bus, routing
+from ..bus.session import LINK, Bus, routing, why_no_listening
 from ..bus.status import StatusPublisher
 from ..config import build
 from ..errors import UserError
@@ -163,6 +163,8 @@ def run(options: ProgramOptions) -> int:
 
 def _on_the_ground(options: ProgramOptions) -> int:
     assert options.secure is not None
+    for why in why_no_listening(options.secure.configuration, options.port):
+        options.report(f"router {options.secure.name} cannot listen on {why}; it tries again")
     with routing(options.secure.configuration, options.port) as linked:
         options.report(f"router {options.secure.name} on port {options.port or options.secure.port}")
         before = 0

@@ -16,7 +16,7 @@ from places import ROOT
 from triline.nodes.bus.authority import AIRCRAFT, DESK, GROUND_LINK, ROUTER, Authority
 from triline.nodes.bus.bundle import load_bundle
 from triline.nodes.bus.downlink import share_of
-from triline.nodes.bus.session import Bus, routing
+from triline.nodes.bus.session import Bus, routing, why_no_listening
 from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.recording.reader import RecordingReader
@@ -98,6 +98,18 @@ def test_who_is_let_in_does_not_depend_on_who_was_certified_last(authority, last
         let_in[name] = {subject["id"] for subject in settings["access_control"]["subjects"]}
     assert ["routers" in let_in[name] for name in ("ground", "ann", "a1")] == [True, True, False]
     assert all({"aircraft-a1", "desks"} <= subjects for subjects in let_in.values())
+
+
+def test_a_router_says_that_its_port_is_taken_and_who_is_linked(authority):
+    port = free_port()
+    certify(authority, port, port)
+    file = authority.folder / "ground" / "zenoh.json5"
+    assert why_no_listening(file) == []
+    with routing(file) as linked, Bus("a1", source="router", file=authority.folder / "a1" / GROUND_LINK, keep=False):
+        wait_for(lambda: linked() == 1, 20, "an aircraft that is counted")
+        assert why_no_listening(file) == [f"127.0.0.1:{port}: address already in use"]
+        with routing(file) as waiting:  # and its end is no fault
+            assert waiting() == 0
 
 
 def test_bundles_of_a_fleet_listen_nowhere_else_and_say_what_is_wrong(authority, tmp_path, capsys):
