@@ -46,8 +46,9 @@ _MESSAGES = (
     "liveliness_query", "declare_liveliness_subscriber",
 )  # fmt: skip
 _READING = ("query", "declare_subscriber", "liveliness_query", "declare_liveliness_subscriber")
-#: What a desk may publish, of any platform: verdicts, and that its own onlookers live.
-DESK_TOPICS = ("observation/verdict", "status/monitor", "status/viewer", "status/ground")
+#: What a desk may publish, of any platform: verdicts, and that its own onlookers live, which is no word of an aircraft.
+DESK_STATUSES = ("status/monitor", "status/viewer", "status/ground")
+DESK_TOPICS = ("observation/verdict", *DESK_STATUSES)
 _DESK_TOKENS = ("alive/monitor", "alive/viewer", "alive/ground")
 #: What an aircraft takes from the ground as a publication; all else that it takes are questions.
 UPLINK_TOPICS = ("observation/verdict",)

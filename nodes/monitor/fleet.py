@@ -12,9 +12,12 @@ from typing import Any
 
 from ...schemas import codec, topics
 from ...schemas.envelope import RawMessage
+from ..bus.authority import DESK_STATUSES
+from ..bus.downlink import share_of
 from ..bus.session import Bus
+from ..node import STOPPING
 from ..terminal import drawing, plain
-from .monitor import LONGEST_NAME, LONGEST_TEXT
+from .monitor import LONGEST_NAME, LONGEST_TEXT, MOST_NODES, SILENT, Overview
 
 #: What is listened to.
 TOPICS = ("status/*", "adjustment/report", "event/log")
@@ -26,6 +29,9 @@ SILENT_S = 15.0
 FLEET = "fleet"
 #: Between two lines where the screen cannot be redrawn, s.
 LINE_S = 5.0
+#: Of every node each n-th status comes down.
+_STATUS = share_of("status/navigator")
+_EVERY = 1 if _STATUS is None else _STATUS.every
 _COLORS = {"good": "green", "weak": "yellow", "failed": "bold red"}
 
 
@@ -36,14 +42,14 @@ class Aircraft:
     Attributes
     ----------
     name : its platform
-    nodes : node -> NodeStatus
+    nodes : what its nodes say of themselves, and which have fallen silent
     report : newest AdjustmentReport
     linked : whether its router is linked with the ground
     heard_s : when something of it was heard last, of a steady clock; adjuster_s : the same of its adjuster's status
     """
 
     name: str
-    nodes: dict[str, Any] = field(default_factory=dict)
+    nodes: Overview = field(default_factory=lambda: Overview(silent=SILENT // _EVERY))
     report: Any = None
     linked: bool = False
     heard_s: float = 0.0
@@ -52,13 +58,15 @@ class Aircraft:
     @property
     def light(self) -> tuple[str, str]:
         """Light and reason of its adjuster; empty without one."""
-        status = self.nodes.get("adjuster")
+        status = self.nodes.nodes.get("adjuster")
         return (status.light, status.light_reason) if status is not None else ("", "")
 
     @property
     def lag_s(self) -> float:
-        """Lag of the node that is furthest behind, s."""
-        return max((status.lag_s for status in self.nodes.values()), default=0.0)
+        """Lag of the node that is furthest behind, of those that run, s."""
+        of = self.nodes
+        running = [s for name, s in of.nodes.items() if s.state != STOPPING and not of.is_silent(name)]
+        return max((status.lag_s for status in running), default=0.0)
 
     @property
     def accuracy_m(self) -> tuple[float, float] | None:
@@ -74,8 +82,8 @@ class Aircraft:
 
     @property
     def alarms(self) -> list[str]:
-        """What its nodes want an operator to look at."""
-        return list(dict.fromkeys(status.alarm for status in self.nodes.values() if status.alarm))
+        """What its nodes want an operator to look at, and which have fallen silent while others speak."""
+        return self.nodes.alarms()
 
 
 class FleetOverview:
@@ -106,12 +114,16 @@ class FleetOverview:
                 self.ground = body.state
                 self._missing = {c.name.removesuffix(" missing"): c.value for c in body.counters if "missing" in c.name}
                 return
+            if raw.topic in DESK_STATUSES:  # a desk that looks at an aircraft, or at none, is not the aircraft
+                return
             aircraft = self._of(platform)
             if aircraft is None:
                 return
             aircraft.heard_s = self._clock()
             if raw.topic.startswith("status/"):
-                aircraft.nodes[raw.topic.partition("/")[2]] = body
+                node = raw.topic.partition("/")[2]
+                if node in aircraft.nodes.nodes or len(aircraft.nodes.nodes) < MOST_NODES:
+                    aircraft.nodes.take_status(node, body)
                 if raw.topic == "status/adjuster":
                     aircraft.adjuster_s = aircraft.heard_s
             elif raw.topic == "adjustment/report":
@@ -165,7 +177,8 @@ class FleetOverview:
         parts = []
         for row in self.rows():
             text = f"{row['name']} {row['light']} {row['link']}, heard {_ago(row['heard_s'])}"
-            parts.append(text + (f", {row['missing']} to come" if row["missing"] else ""))
+            text += f", {row['missing']} to come" if row["missing"] else ""
+            parts.append(text + "".join(f", ALARM: {alarm}" for alarm in row["alarms"]))
         return plain(" | ".join(parts or ["no aircraft heard"]))
 
 

@@ -49,6 +49,7 @@ class Overview:
     said: Counter[str] = field(default_factory=Counter)  # how often each node has told its status
     said_then: dict[str, Counter[str]] = field(default_factory=dict)  # the same when a node told its own last
     ending: bool = False  # nodes are being stopped on purpose: that they fall silent is no alarm
+    silent: int = SILENT  # a node is that has said nothing while another one has so often
 
     @property
     def estimated(self) -> int:
@@ -89,7 +90,7 @@ class Overview:
         then, status = self.said_then.get(name), self.nodes.get(name)
         if then is None or status is None or status.state == STOPPING:
             return False
-        return any(n - then[other] >= SILENT for other, n in self.said.items())
+        return any(n - then[other] >= self.silent for other, n in self.said.items())
 
     def alarms(self) -> list[str]:
         """What nodes want an operator to look at, each once, and which have fallen silent; not those that are being

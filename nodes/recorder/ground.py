@@ -22,6 +22,7 @@ from google.protobuf.message import DecodeError
 from ...schemas import messages as m
 from ...schemas import topics
 from ...schemas.envelope import RawMessage
+from ..bus.authority import DESK_STATUSES
 from ..bus.downlink import INVENTORY, MOST_ASKED, MOST_RUNS, SHARES, Share, share_of
 from ..bus.program import ProgramOptions
 from ..bus.session import Bus
@@ -291,7 +292,9 @@ def _record(ground: Ground, bus: Bus, options: ProgramOptions) -> None:
             (alive.add if there else alive.discard)((platform, node))
 
     def receive(platform: str, raw: RawMessage) -> None:
-        aircraft = ground.recorder_of(platform) if is_known(raw.topic) else None
+        aircraft = None
+        if is_known(raw.topic):  # a desk that looks for an aircraft under any name does not make one
+            aircraft = (ground.aircraft.get if raw.topic in DESK_STATUSES else ground.recorder_of)(platform)
         if aircraft is not None:
             aircraft.heard_s = time.monotonic()
             aircraft.receive(raw)

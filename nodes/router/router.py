@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 
-from ...schemas import topics
+from ...schemas import codec, topics
 from ...schemas.envelope import RawMessage
 from ...schemas.topics import Family
 from ..bus.authority import AIRCRAFT, ROUTER, UPLINK_TOPICS
@@ -36,7 +36,7 @@ from ..bus.session import LINK, Bus, routing, why_no_listening
 from ..bus.status import StatusPublisher
 from ..config import build
 from ..errors import UserError
-from ..node import Node
+from ..node import STOPPING, Node
 from ..ordering import TopicCounts
 
 #: The ground is called again after so long where it does not answer, s.
@@ -85,7 +85,7 @@ class OnBoardRouter(Node):
         if topics.find(raw.topic).family not in (Family.STATUS, Family.OBSERVATION):
             self.newest_ns = max(self.newest_ns, raw.envelope.stamp_ns)
         share = share_of(raw.topic)
-        if share is None or raw.envelope.sequence % share.every:
+        if share is None or (raw.envelope.sequence % share.every and not _is_last_word(raw)):
             return
         if not self.linked and not topics.find(raw.topic).latched:
             return  # the ground asks for it when it is back
@@ -142,6 +142,16 @@ class OnBoardRouter(Node):
     def end(self) -> None:
         """Let go of whoever waits for the link."""
         self._stop.set()
+
+
+def _is_last_word(raw: RawMessage) -> bool:
+    """Whether a node says that it is being stopped: without it the ground would take it for dead."""
+    if not raw.topic.startswith("status/"):
+        return False
+    try:
+        return codec.parse(raw.topic, bytes(raw.data)).state == STOPPING
+    except ValueError:
+        return False
 
 
 def run(options: ProgramOptions) -> int:

@@ -105,6 +105,16 @@ def test_a_router_thins_out_by_numbers_and_lets_images_on_board():
         OnBoardRouter(-1.0)
 
 
+def test_that_a_node_stops_comes_down_whatever_its_number():
+    router = OnBoardRouter()
+    router.linked = True
+    for number, state in enumerate(("running", "running", "stopping")):
+        router.take(raw("status/matcher", number, codec.encode(m.NodeStatus(node="matcher", state=state))))
+    router.take(raw("status/matcher", 3, b"\xff\xff"))
+    sent = [found[0] for found in iter(lambda: router.waiting.take(0.0), None)]
+    assert [r.envelope.sequence for r in sent] == [0, 2]
+
+
 def test_tiles_come_down_small_with_the_means_of_what_is_known():
     size = 4 * THUMBNAIL
     grey = np.zeros((size, size), dtype=np.uint8)

@@ -192,6 +192,8 @@ def test_a_link_that_is_cut_loses_nothing(authority, tmp_path, monkeypatch):
             wait_for(lambda: linked(True) and "ground" in office.alive(), 40, "the link")
             wait_for(lambda: board.alive() >= {"recorder", "router"}, 40, "the nodes on board")
             board.publish(sample.message("configuration/camera"))
+            looked = codec.encode(sample.body("status/monitor"))  # of a desk that looks for one that is not there
+            office._session.put("triline/nobody/status/monitor", looked, attachment=pack(Envelope(1, "monitor", 0, 1)))
             say(0, 100)
             wait_for(lambda: counted("a1 missing") == 0 and (tmp_path / "fleet" / "a1.mcap").exists(), 40, "the first")
             link.closed(3600.0)
@@ -207,6 +209,7 @@ def test_a_link_that_is_cut_loses_nothing(authority, tmp_path, monkeypatch):
             earth.stop(program) if program in earth.processes else air.stop(program) for program in programs[1:]
         ] == [0, 0, 0]
         assert earth.stop(programs[0]) == 0
+    assert [path.name for path in (tmp_path / "fleet").glob("*.mcap")] == ["a1.mcap"]
     board_file, ground_file = RecordingReader(tmp_path / "board.mcap"), RecordingReader(tmp_path / "fleet" / "a1.mcap")
 
     def messages(reader: RecordingReader) -> dict[object, bytes]:

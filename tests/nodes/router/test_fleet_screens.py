@@ -18,6 +18,8 @@ from triline.schemas import codec
 from triline.schemas import messages as m
 from triline.schemas.envelope import Envelope, RawMessage
 
+STOPPED = codec.encode(m.NodeStatus(node="matcher", state="stopping"))
+
 
 def status(node: str, **fields) -> RawMessage:
     body = m.NodeStatus(node=node, state="running", **fields)
@@ -67,6 +69,31 @@ def test_each_aircraft_has_a_row_and_one_that_is_silent_has_no_light():
     assert (one["light"], one["link"], one["heard_s"]) == ("unknown", "gone", SILENT_S + 1.0)
     assert "last known: good" in one["reason"] and two["light"] == "weak"
     assert "a1 unknown gone, heard 16 s ago" in overview.line() and "7 to come" in overview.line()
+
+
+def test_of_a_fleet_too_a_node_that_has_died_is_told_and_one_that_was_stopped_is_not():
+    overview = FleetOverview()
+    overview.take("a1", status("recorder", lag_s=7.0, alarm="the disk is full"))
+    overview.take("a1", RawMessage("status/matcher", Envelope(1, "matcher", 2, 1), STOPPED))
+    for _ in range(SILENT // 4 - 1):  # every fourth status comes down
+        overview.take("a1", status("navigator"))
+    assert overview.rows()[0]["alarms"] == ["the disk is full"]
+    overview.take("a1", status("navigator", lag_s=0.5))
+    row = overview.rows()[0]
+    assert row["alarms"] == ["recorder is silent: it stands still, has died, or is cut off"] and row["lag_s"] == 0.5
+    assert "ALARM: recorder is silent" in overview.line() and "recorder is silent" in shown(overview)
+    overview.take("a1", status("recorder"))
+    assert overview.rows()[0]["alarms"] == []
+
+
+def test_a_desk_that_looks_at_an_aircraft_is_not_the_aircraft():
+    now = [100.0]
+    overview = FleetOverview(lambda: now[0])
+    overview.take("a1", status("adjuster", light="good"))
+    now[0] += SILENT_S + 1.0
+    for platform in ("a1", "demo"):
+        overview.take(platform, status("monitor"))
+    assert [(row["name"], row["heard_s"]) for row in overview.rows()] == [("a1", SILENT_S + 1.0)]
 
 
 def test_where_nothing_is_redundant_there_is_no_sigma0():
