@@ -70,6 +70,8 @@ class OnBoardRouter(Node):
         self.newest_ns = 0
         self.linked = False
         self._stop = threading.Event()
+        self._passed: set[tuple[str, str, int, int]] = set()  # of what goes both ways
+        self._passing = threading.Lock()
 
     def state(self) -> str:
         sent = f"{self.meter.passed / 1e6:.1f} MB down"
@@ -80,8 +82,19 @@ class OnBoardRouter(Node):
         stamp_ns = max(raw.envelope.stamp_ns, self.newest_ns + VERDICT_AHEAD_NS)
         return raw._replace(envelope=raw.envelope._replace(stamp_ns=stamp_ns))
 
+    def passes(self, raw: RawMessage) -> bool:
+        """Whether a message of what goes both ways is new here: each session hears what it says itself, and what was
+        handed on up or down would go round for ever."""
+        key = (raw.topic, raw.envelope.source, raw.envelope.start, raw.envelope.sequence)
+        with self._passing:
+            new = key not in self._passed
+            self._passed.add(key)
+        return new
+
     def take(self, raw: RawMessage) -> None:
         """A message of a node on board; never waits."""
+        if raw.topic in UPLINK_TOPICS and not self.passes(raw):
+            return
         if topics.find(raw.topic).family not in (Family.STATUS, Family.OBSERVATION):
             self.newest_ns = max(self.newest_ns, raw.envelope.stamp_ns)
         share = share_of(raw.topic)
@@ -236,8 +249,13 @@ def _between(router: OnBoardRouter, board: Bus, ground: Bus, options: ProgramOpt
     ground.announce("router")
     for name in QUESTIONS:
         questions(name)
+
+    def up(raw: RawMessage) -> None:
+        if router.passes(raw):
+            board.publish_raw(router.uplink(raw))
+
     for topic in UPLINK_TOPICS:
-        ground.subscribe(topic, lambda raw: board.publish_raw(router.uplink(raw)))
+        ground.subscribe(topic, up)
     for name in router.inputs:
         board.subscribe(name, router.take)
     board.announce("router")

@@ -194,6 +194,15 @@ def test_a_link_that_is_cut_loses_nothing(authority, tmp_path, monkeypatch):
             board.publish(sample.message("configuration/camera"))
             looked = codec.encode(sample.body("status/monitor"))  # of a desk that looks for one that is not there
             office._session.put("triline/nobody/status/monitor", looked, attachment=pack(Envelope(1, "monitor", 0, 1)))
+            verdicts: dict[str, list[str]] = {"board": [], "office": []}
+            board.subscribe("observation/verdict", lambda raw: verdicts["board"].append(raw.envelope.source))
+            office.hear("observation/verdict", lambda _, raw: verdicts["office"].append(raw.envelope.source))
+            with Bus("a1", source="ann", port=earth.port, secure=desk) as surveyor:
+                wait_for(lambda: surveyor.alive() >= {"router"}, 40, "the aircraft, from a desk")
+                surveyor.publish(sample.message("observation/verdict", source="ann"))
+                wait_for(lambda: "ann" in verdicts["board"], 40, "a verdict on board")
+            board.publish(sample.message("observation/verdict", source="pilot"))
+            wait_for(lambda: "pilot" in verdicts["office"], 40, "a verdict on the ground")
             say(0, 100)
             wait_for(lambda: counted("a1 missing") == 0 and (tmp_path / "fleet" / "a1.mcap").exists(), 40, "the first")
             link.closed(3600.0)
@@ -205,6 +214,8 @@ def test_a_link_that_is_cut_loses_nothing(authority, tmp_path, monkeypatch):
             wait_for(lambda: linked(True), 40, "the link again")
             say(200, 250)
             wait_for(lambda: counted("a1 filled") >= before + 100 and counted("a1 missing") == 0, 60, "what was missed")
+        # none goes round between the two sessions of the router on board
+        assert {name: sorted(said) for name, said in verdicts.items()} == {name: ["ann", "pilot"] for name in verdicts}
         assert [
             earth.stop(program) if program in earth.processes else air.stop(program) for program in programs[1:]
         ] == [0, 0, 0]
@@ -220,7 +231,11 @@ def test_a_link_that_is_cut_loses_nothing(authority, tmp_path, monkeypatch):
         return share is not None and share.filled and envelope.sequence % share.every == 0
 
     there, here = messages(board_file), messages(ground_file)
-    assert {key: data for key, data in there.items() if wanted(*key)}.items() <= here.items()
+    mine = {key: data for key, data in there.items() if wanted(*key)}
+    for all_of in (mine, here):  # a verdict of a desk has another stamp on board
+        said_by = sorted(key[1].source for key in list(all_of) if key[0] == "observation/verdict" and all_of.pop(key))
+        assert said_by == ["ann", "pilot"]
+    assert mine.items() <= here.items()
     numbers = sorted(envelope.sequence for topic, envelope in here if topic == "orientation/final")
     assert numbers == list(range(250)) and not any(topic == "sensor/attitude" for topic, _ in here)
     # what the ground does not ask for, statuses, may be missing after a cut
