@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     if args.clock is not None and (topic != "sensor/gnss" or args.reject or not abs(args.clock) <= LARGEST_CLOCK_S):
         raise UserError(f"--clock {args.clock:g}: wanted sensor/gnss and at most {LARGEST_CLOCK_S:g} s, to be added")
     with Bus(source="surveyor", file=args.bus, **bus_of(args)) as bus:
-        heard = _Heard(args.point)
+        heard = _Heard(args.point, not args.reject, args.by)
         for name in ("status/*", "trajectory/filtered", "observation/control", "observation/target", "event/log"):
             bus.subscribe(name, heard.take)
         if args.source:
@@ -142,12 +142,12 @@ class _Heard:
     Attributes
     ----------
     sources, received : who speaks on the topic, and topics of which nodes have received something
-    answer : to the verdict
+    answer : to the verdict; another desk's about the same is another one
     nothing : a node's word that nothing waits on the topic; another node may know of something
     """
 
-    def __init__(self, point: str) -> None:
-        self._point = point
+    def __init__(self, point: str, accepted: bool = True, by: str = "") -> None:
+        self._point, self._accepted, self._by = point, accepted, by
         self.sent = threading.Event()
         self.stamp_ns = 0
         self.points: set[str] = set()
@@ -175,12 +175,19 @@ class _Heard:
             self.points.add(body.point)
         elif not self.sent.is_set():
             return
-        elif raw.topic == "event/log" and body.message.startswith((f"{self._point} is ", f"{self._point} of ")):
+        elif raw.topic == "event/log" and self._answers(body.message):
             self.answer = body.message
         elif raw.topic == "event/log" and body.message.startswith(f"{self._point}: nothing waits"):
             self.nothing = body.message
         elif raw.topic == "observation/target" and body.point == self._point:
             self.looks += body.state in (body.CONFIRMED, body.REJECTED)
+
+    def _answers(self, text: str) -> bool:
+        """Whether a node's word is about this verdict."""
+        if not text.startswith((f"{self._point} is ", f"{self._point} of ")):
+            return False
+        refused = " is rejected" in text or " stays refused" in text
+        return refused is not self._accepted and (not self._by or f"({self._by})" in text)
 
 
 def _is_topic(name: str) -> bool:

@@ -173,15 +173,18 @@ def test_a_verdict_waits_longer_for_nodes_that_live_and_are_heard_late(monkeypat
             while not sent.wait(0.05) and not stop.is_set():
                 bus.publish(Message("status/adjuster", sample.EPOCH_NS, sample.body("status/adjuster"), "adjuster"))
             stop.wait(1.5)
-            bus.publish(Message("event/log", sample.EPOCH_NS, m.Log(name="adjuster", message="GCP1 is confirmed")))
+            for said in ("rejected: its coordinates do not count (Ann)", "confirmed (Bob)", "confirmed (Ann)"):
+                log = m.Log(name="adjuster", message=f"GCP1 is {said}")  # two desks decide at once
+                bus.publish(Message("event/log", sample.EPOCH_NS, log))
+                stop.wait(0.2)
 
         reporting = threading.Thread(target=report, daemon=True)
         reporting.start()
-        code = main(["confirm", "GCP1", "--port", str(port)])
+        code = main(["confirm", "GCP1", "--by", "Ann", "--port", str(port)])
         stop.set()
         reporting.join()
     said = capsys.readouterr()
-    assert (code, said.out) == (0, "GCP1 is confirmed\n"), said.err
+    assert (code, said.out) == (0, "GCP1 is confirmed (Ann)\n"), said.err
 
 
 def test_a_camera_in_flight_waits_for_triline_confirm_and_an_empty_one_is_malformed():
