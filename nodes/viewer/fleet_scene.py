@@ -102,6 +102,8 @@ class FleetScene:
         message : decoded
         time_s : when it was received, s since the begin; platform times of aircraft need not go together
         """
+        if message.topic.startswith("status/") and message.topic != "status/adjuster":
+            return  # nothing is drawn of it, and a desk that looks for an aircraft under any name does not make one
         aircraft = self._of(platform)
         if aircraft is None or not any(topics.find(name).matches(message.topic) for name in TOPICS):
             return

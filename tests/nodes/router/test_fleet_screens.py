@@ -94,6 +94,10 @@ def test_a_desk_that_looks_at_an_aircraft_is_not_the_aircraft():
     for platform in ("a1", "demo"):
         overview.take(platform, status("monitor"))
     assert [(row["name"], row["heard_s"]) for row in overview.rows()] == [("a1", SILENT_S + 1.0)]
+    scene = FleetScene(NullCanvas())
+    for platform, node in (("a1", "adjuster"), ("demo", "monitor")):
+        scene.take(platform, Message(f"status/{node}", 0, m.NodeStatus(node=node)), 0.0)
+    assert list(scene._aircraft) == ["a1"]
 
 
 def test_where_nothing_is_redundant_there_is_no_sigma0():
