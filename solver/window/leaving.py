@@ -114,6 +114,7 @@ class Leaving:
             update.refused += network.intake.without_place(batch, {p.name for p in points})
             left = LeftPoints.of(batch, points)
             self._left.append(left)
+            self._single.passes(batch)
             self._block.leave(batch, left, cells.get(id(batch)), update)
         self._quality.integrity.leave(leaving, forget_s)
         self._control.leaving(leaving, sources.leave(leaving))
@@ -209,6 +210,13 @@ class SingleLooks:
         self._network, self._block, self._sources = network, block, sources
         self._maker = BatchMaker(network)
         self._looked_s = -np.inf
+        self._ground_l = np.empty((0, 3))  # the newest points that have left the window
+
+    def passes(self, batch: Batch) -> None:
+        """A batch leaves: its points say where the ground is until nearer ones are known."""
+        placed = batch.points_l[batch.normals.rank == 3]
+        if len(placed):
+            self._ground_l = placed
 
     def leave(self, now_s: float, limits_s: Mapping[str, float], at_once: bool) -> list[Refusal]:
         """Looks older than the limits of their strips leave, now and then; told as refused: their strip has no use for
@@ -234,18 +242,17 @@ class SingleLooks:
         return self._network.intake.give_up(names)
 
     def _keep(self, strip: WindowStrip, names: list[str]) -> None:
-        """Keep looks of a strip, if its unknowns are there and ground is known near it."""
+        """Keep looks of a strip, if its unknowns are there and it is known about where the ground is: by points of the
+        strip in the window, else by those that left it last."""
         ground = self._network.of_strip(strip)
         points = [self._network.intake.points[name] for name in names]
         times = [p.time_s[0] for p in points]
-        if (
-            not ground
-            or strip.is_gone(self._network.state)
-            or (self._network.state.places(strip.design(times).unknowns()) < 0).any()
-        ):
+        gone = strip.is_gone(self._network.state)
+        if gone or (self._network.state.places(strip.design(times).unknowns()) < 0).any():
             return
         ground.sort(key=lambda b: abs(b.oldest_s - times[0]))
-        near = np.concatenate([b.points_l[b.normals.rank == 3] for b in ground[:GROUND_BATCHES]])
+        placed = [b.points_l[b.normals.rank == 3] for b in ground[:GROUND_BATCHES]]
+        near = np.concatenate(placed) if any(map(len, placed)) else self._ground_l
         batch = self._maker.make_single(names, points, near) if len(near) else None
         if batch is not None:
             looks = [p.looks[0] for p in points]

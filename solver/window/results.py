@@ -23,7 +23,8 @@ class WindowOptions:
     ----------
     model : trajectory model: "wander" (see `models.wander`), "dgr", "ppm", "lim"
     segment_s : longest segment (distance of fixes for "lim"); 0 = a fifteenth of the correlation time
-    window_s : length; 0 = `window_looks` times the time between the first and the last look at a point
+    window_s : length; 0 = `window_looks` times the time between the first and the last look at a point, or that of
+        cameras whose views are not apart (see `screening.arriving`)
     window_looks : see there
     grid_hz : rate of the published orientation
     settle_s : so long after the end of a strip late tie points are waited for; then the strip is final, if smoothed

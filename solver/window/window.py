@@ -33,7 +33,7 @@ from .output import CostHistory, OrientationOutput, WindowReport, WindowUpdate, 
 from .quality.light import Fit
 from .quality.quality_control import QualityControl
 from .results import Look, RefinedOrientation, WindowOptions
-from .screening.arriving import Arrivals, look_time
+from .screening.arriving import Arrivals, usual_length
 from .screening.consensus import ConsensusSchedule, consensus_weights
 from .screening.disagreement import Disagreement
 from .screening.sigma_check import SigmaCheck
@@ -296,7 +296,7 @@ class Window:
         for batch in fresh:
             self._newest_ray_s = max(self._newest_ray_s, batch.newest_s)
         if not self._length_s and fresh and not any(lens_of(self.camera, id) for id in self.strips):
-            self._length_s = self.options.window_looks * look_time(self.camera, fresh[0])
+            self._length_s = usual_length(self.camera, fresh[0], self.options.window_looks)
         return fresh
 
     def _solve(self, fresh: list[Batch]) -> int:

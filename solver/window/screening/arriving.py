@@ -16,6 +16,13 @@ from .entry import EntryEquations, disagreement
 from .snooping import admit
 from .ties import ON_ENTRY, contradicting, drop_weak, meet, set_apart
 
+#: Views nearer together than this, base over height, place no point in their strip: a camera with one CCD line, or with
+#: lines side by side for colours. Its strips are tied by other strips and by control, whenever these come, ...
+LEAST_BASE = 0.05
+#: ... and its window is so long, s. Tuned: that of the strip took 2 to 5 times as long in strips of four minutes; whole
+#: orientation hangs on neither.
+APART_WINDOW_S = 40.0
+
 
 class Arrivals:
     """Makes batches of the points that have news.
@@ -90,8 +97,12 @@ class Arrivals:
         return int(min(point.time_s) // self._step_s), tied
 
 
-def look_time(camera: LineCamera, batch: Batch) -> float:
-    """Time between the first and the last look at a point, s, from view angles, height and speed."""
+def usual_length(camera: LineCamera, batch: Batch, looks: float) -> float:
+    """Length of the window, s: so many times the time between the first and the last look at a point, from view angles,
+    height and speed."""
+    base = float(np.ptp(camera.ahead_mm / camera.focal_length_mm))
+    if base < LEAST_BASE:
+        return APART_WINDOW_S
     height = float(np.median(batch.rays.position_l[:, 2] - batch.points_l[batch.rays.point, 2]))
     speed = float(np.median(np.linalg.norm(batch.rays.velocity_l, axis=1)))
-    return float(np.ptp(camera.ahead_mm / camera.focal_length_mm)) * height / max(speed, 1.0)
+    return looks * base * height / max(speed, 1.0)

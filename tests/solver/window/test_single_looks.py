@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from three_strips import OPTIONS, PLAN, SIDE_BY_SIDE, TIES, flown, usual, usual_at_once, usual_online
 
+from triline.solver.camera.line_camera import LineCamera
 from triline.solver.camera.self_calibration import left_by_calibration
 from triline.solver.simulation.window_study import adjust_at_once, adjust_online, orientation_errors
 from triline.solver.window.block import archive, points
 from triline.solver.window.block.points import SingleLook
 from triline.solver.window.results import TAKEN_BACK
+from triline.solver.window.screening import arriving
 from triline.solver.window.state.maker import BatchMaker
 
 ALONE = "too few looks"
@@ -70,6 +72,33 @@ def test_points_of_single_looks_lie_where_the_looks_meet(monkeypatch):
         whole, wanted = online.whole_points[name], batch.final_points[name]
         sigma = np.sqrt(np.diag(wanted.covariance))
         assert np.abs((whole.xyz_l - wanted.xyz_l) / sigma).max() < 0.1
+
+
+def test_a_camera_with_one_ccd_line_has_a_window_of_its_own_and_loses_no_ties(monkeypatch):
+    """It was as long as the strip, so that updates took longer and longer; in this one control at the
+    beginning of the first strip says no more where the ground is when looks leave that wait for the next strip."""
+    assert arriving.APART_WINDOW_S == 40.0
+    monkeypatch.setattr(arriving, "APART_WINDOW_S", 10.0)
+    camera = PLAN.camera
+    nadir = camera.lines[camera.line_index["N"]]
+    one = LineCamera("one", tuple(lens for lens in camera.lenses if lens.id == nadir.lens), (nadir,))
+    plan = replace(PLAN, camera=one, cross_strips=0, strip_s=50.0, sidelap=0.6)
+    simulation, poses = flown(plan, replace(TIES, control=30))
+    looks, roles = simulation.images.looks, np.array(simulation.points.role)
+    since_s = looks.time_s - simulation.flight.strip_times_s[looks.strip, 0]
+    early = np.unique(looks.point[(looks.strip == 0) & (since_s < 20.0)])
+    begin = simulation.images.select((roles[looks.point] != "control") | np.isin(looks.point, early))
+    result = adjust_online(
+        replace(simulation, images=begin), poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5
+    )
+    left_s = [float(o.time_s[-1]) for o in result.final if o.strip == "S1"]
+    assert left_s[0] < 25.0 and len(left_s) > 5 and left_s[-2] < 45.0
+    ties = [p for name, p in result.whole_points.items() if p.rays == 2]
+    assert len(ties) > 0.95 * (roles == "tie").sum()
+    place = dict(zip(simulation.points.id, simulation.points.xyz_l, strict=True))
+    off = np.array([p.xyz_l - place[p.name] for p in ties])
+    C = np.array([p.covariance for p in ties])
+    assert 0.4 < np.einsum("ni,ni->n", off, np.linalg.solve(C, off[:, :, None])[:, :, 0]).mean() / 3.0 < 1.6
 
 
 @pytest.mark.parametrize("later", [False, True])
