@@ -17,14 +17,15 @@ from ..recording.reader import RecordingReader
 _SIGMAS = ("sigma_X_m", "sigma_Y_m", "sigma_Z_m")
 
 
-def write_points(reader: RecordingReader, path: Path, *, covariance: bool = False) -> int:
+def write_points(reader: RecordingReader, path: Path, *, covariance: bool = False) -> tuple[int, int]:
     """Write ``point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m,rays,role,status,checked`` in the project's CRS.
 
     A CRS in another unit has it in the names of the coordinates (``X_deg,Y_deg,Z_m``); sigmas are in metres. A point
     half of whose rays were left out is checked as ``doubtful``: its sigma is of the rest, and says nothing of these.
 
     The best answer for a point is that of the whole strip, else the final one, else the first; of several of a kind the
-    last. Returns the number of points.
+    last. Returns the number of points, and of those that were live but never final where others became final: their
+    looks were refused since, or the recording ends before.
 
     Parameters
     ----------
@@ -65,4 +66,5 @@ def write_points(reader: RecordingReader, path: Path, *, covariance: bool = Fals
             status = convert.enum_name(m.ObjectPoint.Status, p.status)
             words = [csv_field(p.point), *values, str(p.rays), csv_field(p.role), status, csv_field(p.checked)]
             file.write(",".join(words) + "\n")
-    return len(best)
+    live = sum(p.status == m.ObjectPoint.LIVE for p in best.values())
+    return len(best), live if live < len(best) else 0

@@ -166,7 +166,8 @@ def _run_table(path: Path, args: argparse.Namespace) -> int:
         if args.points is not None:
             project = reader.last("configuration/project")
             refuse_missing_grids("local" if project is None else local_frame(project).crs, path)
-            result["points"] = write_points(reader, part, covariance=bool(args.covariance))
+            result["points"], live = write_points(reader, part, covariance=bool(args.covariance))
+            result |= {"of them live and never final": live} if live else {}
         else:
             name, lines, not_valid = lines_of_recording(recording, args.orientation)
             frame, project = project_frame(recording), recording.project()

@@ -304,6 +304,19 @@ def test_names_with_quotes_and_commas_stay_in_their_column(tmp_path):
     assert [(row["point"], row["Z_m"], row["role"]) for row in rows] == [(name, "3.0000", "tie") for name in names]
 
 
+def test_points_that_never_became_final_are_told(tmp_path, capsys):
+    """Their looks were refused since they were live: one stood there like all others, 134 m off."""
+    points = [m.ObjectPoint(point=name, z=1.0, role="tie", status=status) for name, status in (("A", 0), ("B", 0))]
+    points.append(m.ObjectPoint(point="B", z=1.0, role="tie", status=m.ObjectPoint.WHOLE))
+    messages = [_project(), *(Message("point/object", START + k, point, "adjuster") for k, point in enumerate(points))]
+    path = write_recording(tmp_path / "a.mcap", messages)
+    assert main(["export", str(path), "--points", str(tmp_path / "points.csv")]) == 0
+    assert "2 points, 1 of them live and never final" in capsys.readouterr().out
+    path = write_recording(tmp_path / "b.mcap", messages[:-1])
+    assert main(["export", str(path), "--points", str(tmp_path / "points.csv")]) == 0
+    assert capsys.readouterr().out.rstrip().endswith("2 points")
+
+
 def test_photos_of_two_strips_with_one_name_in_patb_are_refused(tmp_path):
     """Blanks become _ there: lines of S 1 and of S_1 had the same ids."""
     path = tmp_path / "lines.ori"
