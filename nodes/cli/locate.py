@@ -246,9 +246,9 @@ def _met(model: Model, u: Array, v: Array, terrain: HeightRaster, scene: str, no
         met = meet_terrain(model, u[rest], v[rest], terrain, low, high)
         here = np.isfinite(met.lat)
         if here.any():
-            some, places = rest[here], (met.lat[here], met.lon[here], met.height_m[here])
-            located[some] = np.column_stack(places)
-            slope[some] = ground_slopes(terrain, *places, terrain.ellipsoid)
+            some, lat, lon, height_m = rest[here], met.lat[here], met.lon[here], met.height_m[here]
+            located[some] = np.column_stack([lat, lon, height_m])
+            slope[some] = ground_slopes(terrain, lat, lon, height_m, terrain.ellipsoid)
         # what is left may lie on heights that are not among those under the others
         before, rest = len(rest), rest[np.isnan(located[rest, 0])]
         if len(rest) == before:

@@ -347,9 +347,9 @@ def layer_job(
         sigma = inside / f"{stem}.sigma.tif" if settings.sigma else None
         of = _for_image(args, path, meta, crs, gsd, target, sigma)
         sensor, _, _, _, cells = rectify_image.rectified(of)
-        told = cells | {"notes": [note for note in sensor.notes if note not in notes_of_map(crs)]}
         layer = layer_of_orthoimage(target, sigma, inside, stem, crs, gsd, tile, name)
-        layer = replace(layer, told=told | {"notes": [*told["notes"], *layer.told.get("notes", ())]})
+        notes = [note for note in sensor.notes if note not in notes_of_map(crs)]
+        layer = replace(layer, told=cells | {"notes": [*notes, *layer.told.get("notes", ())]})
     else:
         assert strip is not None
         layer = _layer_of_strip(args, path, f"{name} {strip}", strip, inside, stem, settings)

@@ -66,7 +66,7 @@ def stated_priors(camera: FrameCamera, position_m: ArrayLike, attitude_rad: Arra
     by_turn = angles_jacobian(angles_from_matrix(R_el.T @ camera.R_ec))
     angles = np.sqrt(np.square(by_turn) @ np.square(attitude_rad))
     position = np.asarray(position_m, dtype=float)[[1, 0]] / [north, east]
-    stated = dict(zip(("omega", "phi", "kappa", "lat", "lon"), [*angles, *position], strict=True))
+    stated: dict[str, float] = dict(zip(("omega", "phi", "kappa", "lat", "lon"), [*angles, *position], strict=True))
     usual = prior_sigmas(len(TWELVE))
     sigma = np.array([stated.get(name, 0.0) for name in TWELVE])
     return np.where(sigma > 0, sigma, usual)

@@ -98,7 +98,8 @@ def meet_terrain(
         N = _known_or_near(terrain.undulation(lat[1, seen], lon[1, seen]))
         for part in squares(row[1, seen], column[1, seen]):
             some = seen[part]
-            t[some] = _share(*(a[:, some] for a in (lat, lon, row, column)), N[part], middle, half, terrain)
+            places = lat[:, some], lon[:, some], row[:, some], column[:, some]
+            t[some] = _share(*places, N[part], middle, half, terrain)
     return GroundPoints(_at(lat, t), _at(lon, t), middle + half * t)
 
 
@@ -109,7 +110,7 @@ def _share(
 
     ``N`` : (n,) of the geoid, where rays pass the middle of the range
     """
-    N = N.copy()
+    N, t = N.copy(), np.full(len(N), np.nan)
     for _ in range(GEOID_ROUNDS):
         t = _meet(row, column, N, middle, half, terrain)
         met = np.flatnonzero(np.isfinite(t))
