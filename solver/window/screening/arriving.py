@@ -16,12 +16,12 @@ from .entry import EntryEquations, disagreement
 from .snooping import admit
 from .ties import ON_ENTRY, contradicting, drop_weak, meet, set_apart
 
-#: Views nearer together than this, base over height, place no point in their strip: a camera with one CCD line, or with
-#: lines side by side for colours. Its strips are tied by other strips and by control, whenever these come, ...
+#: Views whose base over height is less place no point within a strip: those of a camera with one CCD line, or with
+#: lines side by side for colours. Tuned; cameras with views to several sides have ten times as much.
 LEAST_BASE = 0.05
-#: ... and its window is so long, s. Tuned: that of the strip took 2 to 5 times as long in strips of four minutes; whole
-#: orientation hangs on neither.
-APART_WINDOW_S = 40.0
+#: Window of such a camera, s: its points hang on other strips and on control, for which no window waits long enough.
+#: Tuned: with 10, 20 and 40 s whole points are the same; a longer one makes updates slower and final orientation later.
+SINGLE_VIEW_WINDOW_S = 40.0
 
 
 class Arrivals:
@@ -102,7 +102,7 @@ def usual_length(camera: LineCamera, batch: Batch, looks: float) -> float:
     height and speed."""
     base = float(np.ptp(camera.ahead_mm / camera.focal_length_mm))
     if base < LEAST_BASE:
-        return APART_WINDOW_S
+        return SINGLE_VIEW_WINDOW_S
     height = float(np.median(batch.rays.position_l[:, 2] - batch.points_l[batch.rays.point, 2]))
     speed = float(np.median(np.linalg.norm(batch.rays.velocity_l, axis=1)))
     return looks * base * height / max(speed, 1.0)

@@ -75,10 +75,10 @@ def test_points_of_single_looks_lie_where_the_looks_meet(monkeypatch):
 
 
 def test_a_camera_with_one_ccd_line_has_a_window_of_its_own_and_loses_no_ties(monkeypatch):
-    """It was as long as the strip, so that updates took longer and longer; in this one control at the
-    beginning of the first strip says no more where the ground is when looks leave that wait for the next strip."""
-    assert arriving.APART_WINDOW_S == 40.0
-    monkeypatch.setattr(arriving, "APART_WINDOW_S", 10.0)
+    """The window was as long as the strip, so that updates took longer and longer. Here the only control lies at the
+    beginning of the first strip: when looks that wait for the next strip leave the window, no point in it tells the
+    height of the ground any more."""
+    monkeypatch.setattr(arriving, "SINGLE_VIEW_WINDOW_S", 10.0)
     camera = PLAN.camera
     nadir = camera.lines[camera.line_index["N"]]
     one = LineCamera("one", tuple(lens for lens in camera.lenses if lens.id == nadir.lens), (nadir,))
