@@ -33,8 +33,12 @@ from .points import KeptPoint, SingleLook, rows_of
 #: Unknowns of the strips kept together; beyond that the oldest strip is refined no more. The solution is dense: about
 #: two seconds of one core; with the equations it takes 210 MB, which are kept.
 BLOCK_UNKNOWNS = 4200
-#: Unknowns of one strip, at most, for it to be part of a block, which thus has room for two of them. Tuned.
-MOST_OF_STRIP = 1500
+#: Unknowns of one strip, at most, for it to be part of a block. Two of them are still solved together when the second
+#: is over, which is the work of a turn of a minute; then the first one is closed. Tuned.
+MOST_OF_STRIP = 2800
+#: A-priori equations of a strip that are added to those of the block at a time: all unknowns of a long strip as one
+#: dense matrix would be 60 MB, several times over.
+PRIOR_TOGETHER = 120
 #: Cost of refining a second or so of orientation, and the points of a batch, in floating point operations, about.
 REFINED_ORIENTATION, REFINED_POINTS = 4e7, 8e6
 #: Object points kept, beyond which the oldest strip is refined no more, and single looks kept beside them, beyond which
@@ -112,10 +116,13 @@ class Archive:
         kept = self.strips.get(strip.id)
         if kept is not None:
             kept.entered, kept.constants = strip.entered, strip.constants()
-            columns, coefficients, value, sigma = strip.apriori()
-            places = np.where(columns >= 0, np.searchsorted(kept.entered, columns), -1).astype(np.int32)
-            prior = whiten_prior(PseudoObservations(places, coefficients, value, sigma, ()), len(kept.entered))
-            self.add(kept.entered, prior.normal.toarray(), prior.matrix.T @ prior.value)
+            apriori = strip.apriori()
+            for begin in range(0, len(apriori[0]), PRIOR_TOGETHER):
+                columns, coefficients, value, sigma = (part[begin : begin + PRIOR_TOGETHER] for part in apriori)
+                numbers = np.unique(columns[columns >= 0]).astype(np.int64)
+                places = np.where(columns >= 0, np.searchsorted(numbers, columns), -1).astype(np.int32)
+                prior = whiten_prior(PseudoObservations(places, coefficients, value, sigma, ()), len(numbers))
+                self.add(numbers, prior.normal.toarray(), prior.matrix.T @ prior.value)
 
     def restate_constants(self, factor: Array) -> None:
         """State offset, shift and drift of the strips that are over with factors (4,) that later ones have shown, where

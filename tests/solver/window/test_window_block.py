@@ -18,9 +18,13 @@ from triline.solver.simulation.window_study import (
     navigate,
     orientation_errors,
     point_errors,
+    slow_errors_of,
 )
 from triline.solver.window.block import archive as window_archive
 from triline.solver.window.block import block as window_block
+from triline.solver.window.results import WindowOptions
+from triline.solver.window.state.strip import WindowStrip
+from triline.solver.window.state.unknowns import WindowState
 
 
 @pytest.fixture(scope="module")
@@ -92,14 +96,20 @@ def test_after_the_last_strip_every_line_and_point_has_the_information_of_the_bl
 def test_the_backward_pass_of_the_block_is_that_of_the_window_where_there_is_one_strip(flight):
     one = simulate(replace(PLAN, strips=1, cross_strips=0), 11, SENSORS, TIES)
     poses = navigate(one)
-    block = adjust_online(one, poses, OPTIONS, live=False, update_s=0.5)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("triline.solver.window.block.block.MOST_OF_STRIP", 10)
+        patch.setattr(window_archive, "PRIOR_TOGETHER", 7)
+        block = adjust_online(one, poses, OPTIONS, live=False, update_s=0.5)
+        patch.setattr(window_block, "MOST_OF_STRIP", 10)
         chain = adjust_online(one, poses, OPTIONS, live=False, update_s=0.5)
     assert any("refined alone" in text for text in chain.events)
     difference, sigma = far_apart(block.whole, chain.whole)
     assert difference < 1e-4 and sigma < 1e-6
     assert block.whole_points.keys() == chain.whole_points.keys()
+
+
+def test_a_strip_of_seven_minutes_has_room_in_a_block():
+    strip = WindowStrip("S1", 0.0, 200.0, 420 * 200, slow_errors_of(SENSORS), WindowOptions(), WindowState())
+    assert len(strip.numbers) <= window_archive.MOST_OF_STRIP
 
 
 def test_sigmas_that_a_later_strip_shows_to_be_larger_count_for_the_earlier_ones_too():
