@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"{args.recording}: nothing in it that could be recovered")
     part = args.output.with_name(args.output.name + ".part")
     try:
-        with RecordingWriter(part) as writer:
+        with RecordingWriter(part, reader.compression) as writer:
             for number, raw in zip(reader.index.channel[numbers].tolist(), reader.raws(numbers), strict=True):
                 channel = reader.channels[number]
                 writer.write_raw(raw, channel.platform or None, channel.every)
@@ -44,6 +44,7 @@ def run(args: argparse.Namespace) -> int:
         "messages": len(numbers),
         "chunks": reader.n_chunks,
         "foreign_messages": int(len(reader.index) - len(numbers)),
+        "attachments": reader.attachments,
         "lost_bytes": sum(damage.length for damage in reader.damage),
         "damage": [str(damage) for damage in reader.damage],
         "complete": reader.complete,
@@ -65,4 +66,6 @@ def _lines(r: dict) -> list[str]:
         lines.append("missing by their numbers: " + ", ".join(f"{n} of {topic}" for topic, n in r["missing"].items()))
     if r["foreign_messages"]:
         lines.append(f"left out {r['foreign_messages']} messages of other programs")
+    if r["attachments"]:
+        lines.append(f"left out {r['attachments']} attachments (files of other programs)")
     return lines

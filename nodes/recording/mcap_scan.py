@@ -30,6 +30,8 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")
 FOOTER_SIZE = RECORD_HEAD.size + 20
 #: No writer of recordings makes larger records; a larger length is damage.
 MAX_RECORD = 1 << 32
+#: Opcodes from here on are for records of other programs' own, which readers pass over.
+PRIVATE = 0x80
 #: A record outside chunks that is larger is looked into: its length may be damaged, and skipping it skip whole chunks.
 _LARGE = 1 << 16
 #: What a chunk may unpack to; more is damage, or an attack on the memory.
@@ -201,7 +203,7 @@ def _plausible(buffer: memoryview, position: int) -> bool:
     opcode, length = RECORD_HEAD.unpack_from(buffer, position)
     if opcode == Opcode.FOOTER:
         return length == FOOTER_SIZE - RECORD_HEAD.size
-    return Opcode.HEADER <= opcode <= Opcode.DATA_END and length <= MAX_RECORD
+    return (Opcode.HEADER <= opcode <= Opcode.DATA_END or opcode >= PRIVATE) and length <= MAX_RECORD
 
 
 def _whole_chunk(record: Record) -> WholeChunk:

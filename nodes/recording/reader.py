@@ -61,6 +61,7 @@ class RecordingReader:
     remote : the file elsewhere, None for one that is here
     damage : stretches of the file that cannot be read
     complete : whether the file ends as it should
+    attachments : files in the recording, which no command reads
     problems : counts of messages that were skipped, by kind; ``last_problem`` says what was wrong with the newest
     """
 
@@ -82,6 +83,7 @@ class RecordingReader:
         self.channels: dict[int, Channel] = {}
         self.damage: list[scan.Damage] = []
         self.complete = False
+        self.attachments = 0
         self.library = ""
         self._frame_begins_ns: int | None = None
         self.problems: Counter[str] = Counter()
@@ -104,6 +106,11 @@ class RecordingReader:
     def n_chunks(self) -> int:
         """Whole chunks."""
         return len(self._chunks if self._ranged is None else self._ranged.chunks)
+
+    @property
+    def compression(self) -> str:
+        """Of the first whole chunk, as `RecordingWriter` takes it."""
+        return (self._chunks[0].compression if self._chunks else "") or "none"
 
     @property
     def by_ranges(self) -> bool:
@@ -143,6 +150,8 @@ class RecordingReader:
                     self._note_content(found.content, rows)
                 elif found.opcode in _NOTED:
                     self._note(found, rows)
+                elif found.opcode == Opcode.ATTACHMENT:
+                    self.attachments += 1
             except ValueError as error:
                 self.damage.append(scan.Damage(found.offset, 0, str(error)))
         index = Index.of_rows(rows)

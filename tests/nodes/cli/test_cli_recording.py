@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import socket
+import struct
 import threading
 import time
 from dataclasses import replace
@@ -15,6 +16,9 @@ import pytest
 import sample_messages as sample
 from bus_rig import Rig, simulated_flight, wait_for
 from bus_rig import triline as command
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
 from recording_file import write_recording
 
 import triline
@@ -132,6 +136,35 @@ def test_recover(capsys, flight, tmp_path):
     code, _, err = run(capsys, "recover", tmp_path / "junk", "-o", tmp_path / "x.mcap")
     assert code == 1 and "nothing in it that could be recovered" in err
     assert not (tmp_path / "x.mcap").exists()
+
+
+def test_records_of_other_programs_are_no_damage_and_attachments_are_told(capsys, tmp_path):
+    """Opcodes from 0x80 are free for any program; a recording that was written anew may hold both."""
+    small, mixed, whole = (tmp_path / f"{name}.mcap" for name in ("small", "mixed", "whole"))
+    write_recording(small, sample.flight(3.0), chunk_size=8192)
+    with open(small, "rb") as source, open(mixed, "wb") as file:
+        writer = McapWriter(file, chunk_size=8192, compression=CompressionType.LZ4, enable_data_crcs=False)
+        writer.start("", "another program")
+        numbers: dict[int, int] = {}
+        reader = make_reader(source)
+        for i, (schema, channel, message) in enumerate(reader.iter_messages(log_time_order=False)):
+            if channel.id not in numbers:
+                id = writer.register_schema(schema.name, schema.encoding, schema.data)
+                numbers[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, id, channel.metadata
+                )
+            if i % 100 == 50:
+                file.write(struct.pack("<BQ", 0x80 + i % 128, 40) + bytes(40))
+                writer.add_attachment(0, 0, "notes.txt", "text/plain", b"windy")
+            number = numbers[channel.id]
+            writer.add_message(number, message.log_time, message.data, message.publish_time, message.sequence)
+        writer.finish()
+    assert i > 200
+    assert run(capsys, "check", mixed)[0] == 0
+    code, out, _ = run(capsys, "recover", mixed, "-o", whole)
+    assert code == 0 and "nothing was lost\n" in out and f"left out {(i + 50) // 100} attachments" in out
+    assert len(RecordingReader(whole).index) == len(RecordingReader(small).index)
+    assert RecordingReader(whole).compression == "lz4"
 
 
 def test_what_a_thinned_topic_leaves_out_is_not_missing_in_copies(capsys, tmp_path):
