@@ -338,7 +338,8 @@ def _in_camera(looks: list[Look], sample: Array, cameras: list[tuple[NDArray[np.
 def intersect_points(flight: Flight) -> dict[str, tuple[list[str], Array, Array]]:
     """Point ids, coordinates (p, 3) and covariance (p, 3, 3) by space intersection, by name of INTERSECTED.
 
-    All rows use the same rays: those that the final orientation covers, where there is one. The camera that was
+    All rows use the same rays: those that the final orientation covers, where there is one, and at valid poses, which
+    those of an inertial system are not before it is aligned. The camera that was
     estimated with refined orientation goes with it. The correlation time of slow errors is that of the newest project.
     """
     usable = usable_rays(flight)
@@ -369,15 +370,18 @@ def intersect_points(flight: Flight) -> dict[str, tuple[list[str], Array, Array]
 
 
 def _corrections(flight: Flight, name: str, time_s: Array) -> tuple[Array, Array] | None:
-    """Correction to the filtered orientation (n, 6), NaN where not covered, and covariance (n, 6, 6) at ray times."""
+    """Correction to the filtered orientation (n, 6), NaN where not covered or beside a pose that is not valid, and
+    covariance (n, 6, 6) at ray times."""
     filtered = flight.poses[flight.measured]
     poses = flight.poses.get(name) if name else filtered
     if poses is None or len(poses) < 2:
         return None
     t = flight.seconds(poses.time_ns)
     nearest = np.clip(np.searchsorted(t, time_s), 0, len(t) - 1)
+    before = np.clip(nearest - 1, 0, len(t) - 1)
+    beside = ~(poses.valid[nearest] & poses.valid[before])
     if poses is filtered:
-        return np.zeros((len(time_s), 6)), filtered.covariance[nearest]
+        return np.where(beside[:, None], np.nan, np.zeros((len(time_s), 6))), filtered.covariance[nearest]
     base = flight.poses.get("smoothed", filtered)  # the less noisy trajectory, because it is interpolated
     values = _difference(poses, base, flight.start_ns)
     correction = np.stack([np.interp(time_s, t, values[:, i], np.nan, np.nan) for i in range(6)], axis=1)
@@ -388,8 +392,7 @@ def _corrections(flight: Flight, name: str, time_s: Array) -> tuple[Array, Array
         correction[~known] = np.nan
         correction[known, :3] += a.position_l - b.position_l
         correction[known, 3:] += angle_difference(a.angles, b.angles)
-    before = np.clip(nearest - 1, 0, len(t) - 1)
-    correction[(t[nearest] - t[before] > _LARGEST_GAP_S) & (time_s < t[nearest])] = np.nan
+    correction[beside | ((t[nearest] - t[before] > _LARGEST_GAP_S) & (time_s < t[nearest]))] = np.nan
     return correction, poses.covariance[nearest]
 
 

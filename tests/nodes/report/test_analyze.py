@@ -167,6 +167,8 @@ def test_poses_that_are_not_valid_are_left_out_and_counted(messages, tmp_path):
     n = result["orientation"]["filtered"]["n"]
     assert n + left_out["filtered"] == whole["orientation"]["filtered"]["n"]
     assert result["orientation"]["filtered"]["rmse_m"][0] < 2 * whole["orientation"]["filtered"]["rmse_m"][0]
+    points, all_points = (r["points"]["direct_georeferencing"] for r in (result, whole))
+    assert points["rmse_m"][0] < 2 * all_points["rmse_m"][0] and points["n"] < all_points["n"]
     assert f"are left out: {left_out['filtered']} filtered." in page(flight, result)
 
 
