@@ -21,7 +21,7 @@ from ...solver.adjustment.determinability import Limits, Removal
 from ...solver.adjustment.job import Event, Job, NotAdjustableError, Phase, Pose, refuse_in_parts
 from ...solver.adjustment.job import run as run_job
 from ...solver.adjustment.joined_block import JoinedBlock, join_blocks
-from ...solver.adjustment.options_by_strip import OptionsByStrip
+from ...solver.adjustment.options_by_strip import OptionsByStrip, options_of_strip
 from ...solver.adjustment.robust import WEIGHT_FUNCTIONS
 from ...solver.adjustment.snooping import Round
 from ...solver.adjustment.straightened import straightened
@@ -381,7 +381,8 @@ def by_recording(joined: JoinedBlock, models: Sequence[ModelOptions]) -> ModelOp
     """The model with the settings of each recording; one for all where they say the same."""
     if all(model == models[0] for model in models):
         return models[0]
-    return OptionsByStrip({strip: models[i] for strip, i in joined.recording.items()})
+    before = {name: strip for _, strip, name in joined.renamed}
+    return OptionsByStrip({s: options_of_strip(models[i], before.get(s, s)) for s, i in joined.recording.items()})
 
 
 def job_of(args: argparse.Namespace, block: BlockData) -> Job:
@@ -419,7 +420,7 @@ def models_of(
     """
     steps = step_settings(block.apriori.trajectory, block.apriori.then, model, then, given)
     first, second = (
-        None if name is None else _model(name, settings, block)
+        None if name is None else _model_of_strips(name, settings, block)
         for name, settings in zip((model, then), steps, strict=True)
     )
     assert first is not None
@@ -454,6 +455,15 @@ def _refuse_more_than_rays_carry(settings: Mapping[str, object], name: str, bloc
                 f"--{option} {number}: more than the image points carry, wanted at most {limit} "
                 f"(strip {strip} has the most image points, {most})"
             )
+
+
+def _model_of_strips(name: str, settings: Mapping[str, object], block: BlockData) -> ModelOptions:
+    """The model with what strips have of their own."""
+    usual, of_strip = _model(name, settings, block), block.apriori.of_strip
+    if not of_strip:
+        return usual
+    own = {strip: _model(name, {**settings, **differs}, block) for strip, differs in of_strip.items()}
+    return OptionsByStrip({strip.id: own.get(strip.id, usual) for strip in block.strips})
 
 
 def _model(name: str, settings: Mapping[str, object], block: BlockData) -> ModelOptions:

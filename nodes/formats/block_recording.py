@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -33,9 +33,9 @@ TOPICS = (
 
 #: Differences below this share of a variance are rounding.
 ROUNDING = 1e-9
-#: Strips of together so many seconds are adjusted with the wander of an attitude that is learnt, 0.4 s from border to
-#: border; of longer ones it would take minutes. Tuned.
-FAST_WANDER_S = 120.0
+#: Strips that begin before a filter has found its attitude are adjusted with the wander of one that is learnt, 0.4 s
+#: from border to border, where they last so many seconds together; of longer ones it would take minutes. Tuned.
+FAST_WANDER_S = 240.0
 
 
 @dataclass
@@ -117,19 +117,19 @@ def block_from_messages(messages: Iterable[Message], name: str) -> BlockData:
     reference = 0 if poses[-1][0] < 10**8 * SECOND_NS else poses[0][0] // SECOND_NS * SECOND_NS
     stated = any(getattr(project, key) for key in SIGMAS)
     slow = slow_errors_of(project) if stated else None
-    widened = None if slow is None else _as_uncertain_as_poses(slow, found, poses)
-    slow = widened or slow
-    strips = _strips_of(found, poses, reference, notes, {lens.id for lens in camera.lenses}, slow)
+    widened = {} if slow is None else _as_uncertain_as_poses(slow, found, poses)
+    strips = _strips_of(found, poses, reference, notes, {lens.id for lens in camera.lenses}, slow, widened)
     if not strips:
         raise UserError(f"{name}: no strip with a trajectory; {notes[0] if notes else ''}")
     settings: dict[str, object] = {key: tuple(getattr(project, key)) for key in SIGMAS if getattr(project, key)}
     settings |= {key: getattr(project, key) for key in WANDER_TIMES if getattr(project, key)}
-    if widened is not None:
-        settings |= _settings_of(widened)
+    own = {strip.id: _settings_of(widened[strip.id]) for strip in strips if strip.id in widened}
+    if own:
         notes.append(
-            f"{name}: poses are less certain than the project states; so are slow errors, as they are adjusted"
+            f"{name}: where strip {', '.join(own)} begins poses are less certain than the project states; so are slow "
+            "errors there, as they are adjusted"
         )
-    apriori = Apriori(project.image_sigma_px or Apriori.image_sigma_px, settings, wide=widened is not None)
+    apriori = Apriori(project.image_sigma_px or Apriori.image_sigma_px, settings, of_strip=own, wide=bool(own))
     if poses[0][0] < found.camera_ns:
         notes.append(
             f"{name}: before {iso(found.camera_ns)} nodes used another camera; image points of then are adjusted with "
@@ -161,6 +161,7 @@ def _strips_of(
     notes: list[str],
     lenses: set[str],
     slow: SlowErrors | None,
+    widened: Mapping[str, SlowErrors],
 ) -> tuple[Strip, ...]:
     time_ns = np.array([pose[0] for pose in poses], dtype=np.int64)
     label = np.array([pose[1] for pose in poses], dtype=object)
@@ -193,7 +194,7 @@ def _strips_of(
             [(q.position.x, q.position.y, q.position.z) for q in p],
             [(q.orientation.x, q.orientation.y, q.orientation.z, q.orientation.w) for q in p],
         )
-        noise = _noise_of(bodies, slow)
+        noise = _noise_of(bodies, widened.get(id, slow))
         lens = id.rpartition("/")[2] if "/" in id else None
         strip = Strip(
             id,
@@ -248,27 +249,33 @@ def _notes_of_validity(strip: str, poses: list[Any]) -> list[str]:
     ]
 
 
-def _as_uncertain_as_poses(slow: SlowErrors, found: _Collected, poses: list[tuple[int, str, Any]]) -> SlowErrors | None:
-    """Slow errors of a trajectory whose poses are clearly less certain than its project states; None where none is.
+def _as_uncertain_as_poses(
+    slow: SlowErrors, found: _Collected, poses: list[tuple[int, str, Any]]
+) -> dict[str, SlowErrors]:
+    """By its name, slow errors of each strip at whose begin the poses are clearly less certain than the project states.
 
     As on line, what a filter does not know at the begin of a strip is an error for long, and no noise of single poses
-    (`SlowErrors.widened`); its wander is as fast as there, unless the strips are so long that this would take too many
+    (`SlowErrors.widened`); its wander is as fast as there, unless such strips are so long that this would take too many
     unknowns (`FAST_WANDER_S`): then it is as slow as the project states.
     """
-    times = np.array([pose[0] for pose in poses], dtype=np.int64)
-    variance = np.zeros(6)
-    for body in found.strips.values():
+    times, wider = np.array([pose[0] for pose in poses], dtype=np.int64), {}
+    for id, body in found.strips.items():
         covariance = poses[min(int(np.searchsorted(times, body.first_line_time_ns)), len(poses) - 1)][2].covariance
         if len(covariance) == 36 and np.isfinite(covariance).all():
-            variance = np.maximum(variance, covariance[::7])
-    wider = slow.widened(np.diag(variance))
-    if wider is slow:
-        return None
-    lasts_s = sum(body.lines / body.line_rate_hz if body.line_rate_hz > 0 else 0.0 for body in found.strips.values())
-    if all(body.lines for body in found.strips.values()) and lasts_s <= FAST_WANDER_S:
+            own = slow.widened(np.diag(covariance[::7]))
+            if own is not slow:
+                wider[id] = own
+    bodies = [found.strips[id] for id in wider]
+    lasts_s = sum(body.lines / body.line_rate_hz if body.line_rate_hz > 0 else 0.0 for body in bodies)
+    if all(body.lines for body in bodies) and lasts_s <= FAST_WANDER_S:
         return wider
-    times_s = {"wander_time_s": slow.wander_time_s, "attitude_time_s": slow.attitude_time_s}
-    metres = np.sqrt(np.square(slow.wander_m) + np.square(wider.offset_m) - np.square(slow.offset_m)).tolist()
+    return {id: _slowly(own, slow) for id, own in wider.items()}
+
+
+def _slowly(wider: SlowErrors, stated: SlowErrors) -> SlowErrors:
+    """Widened errors with a wander as slow as stated."""
+    metres = np.sqrt(np.square(stated.wander_m) + np.square(wider.offset_m) - np.square(stated.offset_m)).tolist()
+    times_s = {"wander_time_s": stated.wander_time_s, "attitude_time_s": stated.attitude_time_s}
     return replace(wider, wander_m=(metres[0], metres[1], metres[2]), **times_s)
 
 

@@ -88,12 +88,14 @@ class Apriori:
     trajectory : the ``[trajectory]`` table as written (sigmas of the corrections), what a trajectory model's
         ``from_settings`` takes; a key that is absent gets the model's default
     then : the ``[trajectory.then]`` table: what the second of two models has of its own
-    wide : sigmas of the trajectory are those of its filter, far larger than what the corrections find
+    of_strip : by the name of a strip, what differs there from ``trajectory``
+    wide : sigmas of the trajectory are in some strips those of its filter, far larger than what the corrections find
     """
 
     image_sigma_px: float = 0.3
     trajectory: Mapping[str, object] = field(default_factory=dict)
     then: Mapping[str, object] = field(default_factory=dict)
+    of_strip: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
     wide: bool = False
 
 

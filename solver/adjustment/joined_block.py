@@ -91,6 +91,7 @@ def join_blocks(blocks: Sequence[BlockData], names: Sequence[str]) -> JoinedBloc
         point_ids=point_ids,
         ground=ground,
         image=image,
+        apriori=replace(first.apriori, wide=any(block.apriori.wide for block in blocks)),
         notes=notes,
         refused=frozenset[str]().union(*(block.refused for block in blocks)),
     )

@@ -1,4 +1,5 @@
-"""Settings of a trajectory model that differ from strip to strip: recordings of several days or aircraft."""
+"""Settings of a trajectory model that differ from strip to strip: recordings of several days or aircraft, and strips
+that began before a filter had found its attitude."""
 
 from __future__ import annotations
 
@@ -40,7 +41,11 @@ class OptionsByStrip(ModelOptions):
         return self.options[extent.strip].build(extent)
 
 
+def options_of_strip(model: ModelOptions, strip: str) -> ModelOptions:
+    """Settings of a model for a strip."""
+    return model.options[strip] if isinstance(model, OptionsByStrip) else model
+
+
 def slow_errors_of_strip(model: ModelOptions, strip: str) -> SlowErrors | None:
     """Slow errors that a model states for a strip."""
-    own = model.options[strip] if isinstance(model, OptionsByStrip) else model
-    return getattr(own, "slow", None)
+    return getattr(options_of_strip(model, strip), "slow", None)

@@ -307,7 +307,7 @@ def test_what_an_inertial_filter_does_not_know_is_no_noise_of_single_poses(tmp_p
     assert main(["process", str(flight), "-o", str(oriented), "--nodes", "navigator", "-q"]) == 0
     assert adjust(oriented, "-q", "-o", tmp_path / "out") == 0
     result = result_in(tmp_path / "out")
-    assert any("poses are less certain than the project states" in note for note in result["notes"])
+    assert any("strip S1 begins poses are less certain than the project states" in note for note in result["notes"])
     rmse, sigma = np.array(result["check"]["rmse_m"]), np.array(result["check"]["sigma_m"])
     assert (rmse < [0.2, 0.3, 0.7]).all() and (rmse < 2.0 * sigma).all() and (sigma < 0.5).all()
     # sigmas that hold until a filter has found its attitude are no observations: residuals would be next to nothing

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,12 +13,15 @@ from places import BLOCKS, needs_blocks
 from small_block import FILES, simulated_block, write_files
 
 from triline.nodes.cli import main
+from triline.nodes.cli.adjust import by_recording, models_of
 from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
 from triline.nodes.formats.block_messages import block_messages, not_carried
 from triline.nodes.formats.block_recording import block_from_messages
 from triline.nodes.formats.projection import refuse_missing_grids, unknown_heights
 from triline.solver.adjustment.block_data import network_from_block
+from triline.solver.adjustment.joined_block import join_blocks
+from triline.solver.adjustment.options_by_strip import slow_errors_of_strip
 from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion
 from triline.solver.models.lim import LimOptions
 from triline.solver.models.wander import WanderOptions
@@ -327,6 +331,38 @@ def test_omitting_convergence_would_be_seen(tmp_path):
     kappa = np.loadtxt(tmp_path / "trajectory.csv", delimiter=",", skiprows=1, usecols=7, max_rows=1)
     true = np.degrees(angles_from_matrix(matrix_from_quaternion(block.strips[0].trajectory.quaternion[0])))[2]
     assert kappa - true == pytest.approx(convergence, abs=0.02)
+
+
+def less_certain(messages, strip, sigma_kappa):
+    """The messages of a block with poses of a strip whose kappa is as uncertain as that, rad."""
+    for message in messages:
+        if message.topic == "trajectory/smoothed" and message.body.strip == strip:
+            message.body.covariance[35] = sigma_kappa**2
+        yield message
+
+
+def test_strips_that_begin_before_a_filter_has_found_its_attitude_are_stated_apart(tmp_path):
+    """One sigma for all: sigma0 was 0.8 and points twice as far off in flights whose first strip alone began so."""
+    write_block(tmp_path, simulated_block("local"))
+    read = read_block(tmp_path)
+    first, *others = (strip.id for strip in read.strips)
+    assert others
+    block = block_from_messages(less_certain(block_messages(read), first, 0.02), "flight")
+    assert list(block.apriori.of_strip) == [first] and block.apriori.wide
+    assert any(f"where strip {first} begins poses are less certain" in note for note in block.notes)
+    model, _ = models_of(block, "wander", None, {})
+    usual, _ = models_of(block_from_messages(block_messages(read), "flight"), "wander", None, {})
+    assert all(slow_errors_of_strip(model, id) == usual.slow for id in others)
+    own = slow_errors_of_strip(model, first)
+    assert own.shift[2] == pytest.approx(0.02, rel=0.01) and own.shift[:2] == pytest.approx(usual.slow.shift[:2])
+    assert {strip.id: strip.noise is None for strip in block.strips} == dict.fromkeys((first, *others), True)
+    # a second flight with strips of the same names, which get others: each has its own still
+    flights = [block, replace(block, apriori=replace(block.apriori, of_strip={}, wide=False))]
+    joined = join_blocks(flights[::-1], ["day1", "day2"])
+    assert joined.renamed and joined.block.apriori.wide
+    both = by_recording(joined, [models_of(flight, "wander", None, {})[0] for flight in flights[::-1]])
+    assert slow_errors_of_strip(both, f"{first}@day2") == own
+    assert slow_errors_of_strip(both, f"{first}@day1") == slow_errors_of_strip(both, f"{others[0]}@day2") == usual.slow
 
 
 def test_missing_geoid_grid_is_told(tmp_path):
