@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...schemas.units import place_columns
 from ...solver.adjustment.reliability import CRITICAL_W, reliability
 from ...solver.adjustment.statistics import GlobalTest, global_test, mean_sigma, point_accuracy, strongest_correlations
+from ...solver.adjustment.variance_components import LEAST_REDUNDANCY
 from ...solver.camera.self_calibration import SELF_CALIBRATIONS, unit_of
 from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.location.rpc_fit import fit_to_model
@@ -122,10 +123,15 @@ class SceneAdjustment:
         """Chi-square test of sigma0."""
         return _test(self.solution)
 
+    @property
+    def sigma0(self) -> float:
+        """What sigmas are scaled with, see `_scale`."""
+        return _scale(self.solution)
+
     @cached_property
     def single_looks(self) -> SingleLooks:
         """Rays of check points that nothing else determines."""
-        return single_looks(self.solution, self.test.sigma0)
+        return single_looks(self.solution, self.sigma0)
 
     def values_of(self, image: int) -> Array:
         """Unknowns of an image."""
@@ -322,9 +328,15 @@ def _test(solution: SceneSolution) -> GlobalTest:
     return global_test(solution.weighted_squares, max(solution.redundancy, 0))
 
 
+def _scale(solution: SceneSolution) -> float:
+    """What sigmas are scaled with: sigma0 a posteriori, or 1 where image points and control have too little redundancy
+    to estimate it."""
+    return _test(solution).sigma0 if solution.measured_redundancy >= LEAST_REDUNDANCY else 1.0
+
+
 def _sigmas(solution: SceneSolution) -> Array:
     """Sigmas (u,) of the unknowns, a posteriori."""
-    return _test(solution).sigma0 * np.sqrt(np.maximum(np.diag(solution.values_covariance), 0.0))
+    return _scale(solution) * np.sqrt(np.maximum(np.diag(solution.values_covariance), 0.0))
 
 
 def _unknowns(problem: Problem, solution: SceneSolution) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -390,7 +402,7 @@ def differences(a: SceneAdjustment, *roles: str) -> tuple[NDArray[np.int64], Arr
 
 def point_sigmas(a: SceneAdjustment) -> Array:
     """Sigmas (p, 3) in metres of all points, east, north, up, a posteriori; NaN where not determined."""
-    return a.test.sigma0 * np.sqrt(np.maximum(np.einsum("pii->pi", a.solution.points_covariance), 0.0))
+    return a.sigma0 * np.sqrt(np.maximum(np.einsum("pii->pi", a.solution.points_covariance), 0.0))
 
 
 def _accuracies(a: SceneAdjustment) -> dict[str, Any]:
@@ -448,7 +460,7 @@ def _expected(a: SceneAdjustment, sigma: Array, survey: Array, *, independent: b
     sigma : (k, 3) of the adjusted points, NaN where nothing is compared
     survey : (k, 3) variances of the given coordinates, 0 where none is stated
     """
-    both = survey + sigma**2 if independent else np.maximum(a.test.sigma0**2 * survey - sigma**2, 0.0)
+    both = survey + sigma**2 if independent else np.maximum(a.sigma0**2 * survey - sigma**2, 0.0)
     used = np.isfinite(both)
     n = used.sum(axis=0)
     if not n.any():
@@ -539,6 +551,11 @@ def _notes(a: SceneAdjustment) -> list[str]:
         notes.append(f"not converged after {s.iterations} iterations")
     if s.redundancy <= 0:
         notes.append("no redundancy: nothing is checked")
+    elif s.measured_redundancy < LEAST_REDUNDANCY:
+        notes.append(
+            f"redundancy of image points and control is {s.measured_redundancy:.1f}: too little for sigma0; "
+            "sigmas are those of the a-priori weights"
+        )
     notes += [f"undetermined: {words}" for words in s.undetermined]
     for image in _rigorous(a):
         notes += [n for n in image.corrections.model.notes if n not in notes]
@@ -600,7 +617,7 @@ def _write_points(a: SceneAdjustment, path: Path) -> None:
         places[known] = frame.to_crs(local)
         R = np.swapaxes(frame.R_l_crs(places[known]), -1, -2) @ frame.R_el.T @ a.problem.R_e_enu[known]
         C = R @ s.points_covariance[known] @ np.swapaxes(R, -1, -2)
-        sigma[known] = a.test.sigma0 * np.sqrt(np.maximum(np.einsum("pii->pi", C), 0.0))
+        sigma[known] = a.sigma0 * np.sqrt(np.maximum(np.einsum("pii->pi", C), 0.0))
     rays = np.bincount(data.rays.point, s.ray_weight, n).astype(int)
     role = np.full(n, "tie", dtype=object)
     role[a.problem.block.known.point] = a.problem.block.known.role
@@ -664,7 +681,7 @@ def _write_orientation(a: SceneAdjustment, path: Path) -> None:
         numbers, functions = model.design(t).functions()
         own = layout.columns[k][: model.n_unknowns][numbers]
         Q = a.solution.values_covariance[np.ix_(own, own)]
-        sigma = a.test.sigma0 * np.sqrt(np.maximum(np.einsum("nci,ij,ncj->nc", functions, Q, functions), 0.0))
+        sigma = a.sigma0 * np.sqrt(np.maximum(np.einsum("nci,ij,ncj->nc", functions, Q, functions), 0.0))
         sigma[:, 3:] = np.degrees(sigma[:, 3:])
         columns["strip"] += [entry.scene.name] * len(line)
         columns["ccd"] += [entry.ccd] * len(line)

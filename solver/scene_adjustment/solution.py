@@ -136,6 +136,13 @@ class SceneSolution:
         """A-posteriori sigma of unit weight; 1 without redundancy."""
         return float(np.sqrt(self.weighted_squares / self.redundancy)) if self.redundancy > 0 else 1.0
 
+    @property
+    def measured_redundancy(self) -> float:
+        """Share of image points and known coordinates in the redundancy."""
+        points, axes = np.nonzero(self.given)
+        left = self.points_covariance[points, axes, axes] / self.problem.covariance_enu[points, axes, axes]
+        return float(self.redundancy_numbers.sum() + np.clip(1.0 - left, 0.0, 1.0).sum())
+
 
 def prepare(block: SceneBlock) -> Problem:
     """Measured rays, axes of points and start values.

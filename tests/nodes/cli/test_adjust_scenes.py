@@ -146,6 +146,36 @@ def test_check_points_of_a_scene_alone_are_compared_at_their_heights(tmp_path, c
     assert abs(table.w_sample["P12"]) > 10.0 and np.abs(table.drop("P12")[["w_line", "w_sample"]]).max().max() < 4.0
 
 
+def test_few_control_points_do_not_scale_the_sigmas(block, capsys):
+    """A shift of polynomials by two control points: sigma0 of two observations too many was anything from 0.2 to 2,
+    and good pixels of check points were named as wrong."""
+    rpc = fit_to_model(read_scene(block / "spot5-hrs").sensors["F"], -500.0, 2500.0).rpc
+    write_rpb(block / "F.RPB", rpc)
+    head = (block / "project.toml").read_text().split("[scenes")[0]
+    (block / "project.toml").write_text(head + '[rpc]\ncorrection = "shift"\n[scenes.forward]\nmetadata = "F.RPB"\n')
+    ground = pd.read_csv(block / "ground_points.csv")
+    ground["role"] = ["control"] * 2 + ["check"] * (len(ground) - 2)
+    ground[["sigma_X_m", "sigma_Y_m", "sigma_Z_m"]] = [[0.1] * 3] * 2 + [[0.0] * 3] * (len(ground) - 2)
+    ground.to_csv(block / "ground_points.csv", index=False)
+    pixel = rpc.inverse(*np.radians([ground.Y_m, ground.X_m]), ground.Z_m.to_numpy())
+    sigma0, squares, named = [], [], 0
+    for seed in range(6):
+        noise = np.random.default_rng(seed).normal(0.0, 0.3, pixel.shape)
+        measured = pd.DataFrame(pixel + np.array([12.0, -7.0]) + noise, columns=["line", "sample"])
+        table = pd.concat([ground[["point"]].assign(strip="forward", ccd=""), measured], axis=1)
+        table.assign(sigma_px=0.3).to_csv(block / "image_points.csv", index=False)
+        assert main(["adjust", str(block), "--json"]) == 0
+        result = json.loads(capsys.readouterr().out)
+        assert any("too little for sigma0" in note for note in result["notes"])
+        named += sum(int(note.split()[0]) for note in result["notes"] if "pixels of check points" in note)
+        coefficient = result["strips"]["forward"]["coefficients"]["sample shift"]
+        np.testing.assert_allclose(coefficient["sigma"], 0.3 / np.sqrt(2.0), rtol=0.05)
+        sigma0.append(result["sigma0"])
+        squares.append(np.square(np.divide(result["check_single"]["rmse_px"], result["check_single"]["expected_px"])))
+    assert min(sigma0) < 0.6 and named <= 3
+    assert 0.5 < np.mean(squares) < 1.6
+
+
 def test_what_is_known_of_the_orbit_counts_once_in_two_models(block, capsys):
     """A second model finds next to nothing beside its a-priori sigmas; those stated for it alone are knowledge."""
     found = []
