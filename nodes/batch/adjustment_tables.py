@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ...schemas.units import place_columns
 from ...solver.adjustment.layout import CorrectionSet
-from ...solver.adjustment.refined_orientation import correction_cofactors, corrections_at
+from ...solver.adjustment.pose_noise import orientation_noise
+from ...solver.adjustment.refined_orientation import AT_ONCE, correction_cofactors, corrections_at
 from ...solver.adjustment.reliability import reliability
 from ...solver.geometry.rotation import corrected_angles, matrix_from_angles
 from ..formats.line_orientation import OrientedLines, poses_in_crs
@@ -131,9 +132,19 @@ def _seconds(time_s: Array, reference_ns: int) -> Array | list[str]:
 
 
 def _refined(adjustment: Adjustment, item: CorrectionSet, time_s: Array) -> tuple[Array, Array, Array]:
-    """Position (n, 3) and rotation (n, 3, 3) to the local frame, and the covariance (n, 6, 6) of their corrections."""
+    """Position (n, 3) and rotation (n, 3, 3) to the local frame, and their covariance (n, 6, 6).
+
+    It is that of the corrections, with what these cannot follow: the slow errors between borders, and the noise of the
+    measured poses.
+    """
     poses = adjustment.block.strips[item.strip].trajectory.at(time_s)
     correction, covariance = correction_functions(adjustment, item, time_s)
+    result = adjustment.result
+    for i in range(0, len(time_s), AT_ONCE):
+        some = slice(i, i + AT_ONCE)
+        noise = orientation_noise(result.solution, result.information, item.strip, time_s[some])
+        left_out = item.model.left_out_variance(time_s[some])[:, :, None] * np.eye(6)
+        covariance[some] += result.sigma0**2 * (noise + left_out)
     turn = correction[:, 3:]
     angles = corrected_angles(poses.angles, turn) if adjustment.block.heading else poses.angles + turn
     return poses.position_l + correction[:, :3], matrix_from_angles(*angles.T), covariance

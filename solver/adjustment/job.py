@@ -21,7 +21,7 @@ from .normal_equations import Prior, reduce_normals, whiten_prior
 from .normal_matrix import DenseMatrix
 from .parameter_elimination import eliminate, own_information
 from .point_consensus import Doubt, doubts
-from .pose_noise import with_noise_left
+from .pose_noise import Pieces, noise_information, with_noise_left
 from .ray_statistics import RayStatistics, ray_statistics
 from .reliability import CRITICAL_W
 from .robust import Huber, WeightFunction
@@ -143,6 +143,7 @@ class BatchResult:
     iterations : steps of all adjustments
     doubtful : object points that the rays they kept do not confirm; comparisons leave them out
     surface : what came of the heights of the surface that points lie on; None without one
+    information : of the rays about the corrections, see `pose_noise`; empty where poses have no correlated noise
     """
 
     stages: tuple[Solution, ...]
@@ -161,6 +162,7 @@ class BatchResult:
     iterations: int
     doubtful: tuple[Doubt, ...] = ()
     surface: SurfaceFit | None = None
+    information: Pieces = field(default_factory=dict, repr=False)
 
     @property
     def solution(self) -> Solution:
@@ -271,7 +273,16 @@ def run(network: Network, job: Job, progress: Progress | None = None, pose: Pose
         outcome.steps,
         doubts(solution, lost, joint_limit(job.critical)),
         outcome.surface_fit(),
+        _information(solution),
     )
+
+
+def _information(solution: Solution) -> Pieces:
+    """What says how much of the noise of poses the corrections follow; nothing where it is white."""
+    if not any(strip.noise is not None and strip.noise_time_s for strip in solution.network.strips):
+        return {}
+    parts = solution.problem.parts
+    return noise_information(solution) if parts is None else parts.noise_information(solution)
 
 
 def refuse_in_parts(network: Network, job: Job) -> None:

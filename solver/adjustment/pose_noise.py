@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Array, IntArray
 from ..geometry.measured_trajectory import MeasuredPoses, MeasuredTrajectory
+from ..geometry.trajectory import noise_between
 from ..models.base import ModelOptions
 from ..navigation.kinematic_model import NOISE_TIMES_BANDWIDTH
 from .linearisation import Linearisation
@@ -135,15 +136,33 @@ def noise_information(solution: Solution) -> Pieces:
 
 def noise_left(rays: Rays, pieces: Pieces, strips: Sequence[Strip], model: ModelOptions) -> Array:
     """What corrections leave of the noise of position of rays: (n, 6, 6), see `followed`."""
-    left = np.broadcast_to(np.eye(6), (len(rays), 6, 6)).copy()
-    number = np.floor(rays.time_s / PIECE_S).astype(np.int64)
+    left = np.empty((len(rays), 6, 6))
     for i in np.unique(rays.strip).tolist():
-        mine, slow = np.flatnonzero(rays.strip == i), slow_errors_of_strip(model, strips[i].id)
-        if slow is None:
-            continue
-        for k in np.unique(number[mine]).tolist():
-            left[mine[number[mine] == k]] = followed(pieces[i, k], slow.wander_density, strips[i].noise_time_s)
+        mine = np.flatnonzero(rays.strip == i)
+        left[mine] = noise_left_at(rays.time_s[mine], pieces, i, strips[i], model)
     return left
+
+
+def noise_left_at(time_s: Array, pieces: Pieces, number: int, strip: Strip, model: ModelOptions) -> Array:
+    """The same at times (n,) of a strip, which is ``number`` in the pieces; all of it where there are no rays."""
+    left = np.broadcast_to(np.eye(6), (len(time_s), 6, 6)).copy()
+    slow = slow_errors_of_strip(model, strip.id)
+    if slow is None:
+        return left
+    piece = np.floor(time_s / PIECE_S).astype(np.int64)
+    for k in np.unique(piece).tolist():
+        if (number, k) in pieces:
+            left[piece == k] = followed(pieces[number, k], slow.wander_density, strip.noise_time_s)
+    return left
+
+
+def orientation_noise(solution: Solution, pieces: Pieces, strip: int, time_s: Array) -> Array:
+    """Noise (n, 6, 6) of the measured poses of a strip at times (n,) that the corrections of a solution leave."""
+    own = solution.network.strips[strip]
+    if own.noise is None:
+        return np.zeros((len(time_s), 6, 6))
+    noise = noise_between(own.trajectory.time_s, own.noise, time_s)
+    return left_of_noise(noise, noise_left_at(time_s, pieces, strip, own, solution.problem.model))
 
 
 #: Information is kept so long, s.

@@ -117,6 +117,10 @@ class Parts(Protocol):
         """`point_consensus.consensus_of_points`."""
         ...
 
+    def noise_information(self, solution: Solution) -> Any:
+        """`pose_noise.noise_information`."""
+        ...
+
     def with_noise_left(self, solution: Solution) -> bool:
         """Weigh rays with what `pose_noise.with_noise_left` leaves, from the next solution on; False for all of it."""
         ...

@@ -16,6 +16,7 @@ from ..adjustment.layout import Layout
 from ..adjustment.linearisation import Linearisation, Whitening
 from ..adjustment.network import Network, Rays
 from ..adjustment.normal_equations import PointNormals, weigh_control
+from ..adjustment.pose_noise import Pieces
 from ..adjustment.problem import AdjustmentOptions, Iteration, Problem, Solution, State
 from ..adjustment.ray_statistics import RayStatistics
 from ..camera.self_calibration import SelfCalibration
@@ -195,13 +196,17 @@ class Engine:
                 result[int(point + self._points[key])] = rays + self._rays[key], rival, place
         return result
 
+    def noise_information(self, solution: Solution) -> Pieces:
+        assert isinstance(solution, SolutionInParts) and solution.kept is not None
+        version = solution.kept.version
+        return self.runner.run(tasks.information, self.block.keys, lambda key: (version,), tasks.both)
+
     def with_noise_left(self, solution: Solution) -> bool:
-        assert isinstance(solution, SolutionInParts) and solution.kept is not None and self._network is not None
+        assert self._network is not None
         slow, strips = getattr(solution.problem.model, "slow", None), self._network.strips
         if slow is None or not self._noisy or not any(s.noise_time_s for s in strips):
             return False
-        version = solution.kept.version
-        pieces = self.runner.run(tasks.information, self.block.keys, lambda key: (version,), tasks.both)
+        pieces = self.noise_information(solution)
         light = tuple(replace(s, noise=None) for s in strips)
         self.runner.store.save("pieces", (pieces, solution.problem.model, light))
         for _ in self.runner.each(tasks.pose_with_noise, self.block.keys, lambda key: ()):
