@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...solver.adjustment.variance_components import LEAST_REDUNDANCY
 from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
 from ...solver.location.affine_bias import BiasFit, CorrectedModel, fit_bias
 from ...solver.location.cropped import CroppedModel
@@ -520,8 +521,10 @@ def _error_map(args: argparse.Namespace, sensor: _Sensor) -> ErrorMap | None:
     if fit is not None:
         words = "sigma: of the correction by control, in place of the orientation's"
         if args.pixel_sigma is None and fit.redundancy > 0:  # nobody has stated how well control is measured
-            factor = fit.sigma0
-            words += f", with control as good as it fits ({factor * CONTROL_SIGMA_PX:.2g} px)"
+            few = fit.redundancy < LEAST_REDUNDANCY  # a few points may fit well by chance
+            factor = max(fit.sigma0, 1.0) if few else fit.sigma0
+            good = "half a pixel, since few points do not tell" if few and factor == 1.0 else "it fits"
+            words += f", with control as good as {good} ({factor * CONTROL_SIGMA_PX:.2g} px)"
         sensor.notes.append(words)
     elif not (oriented or rpc_m2 or stated.time_s):
         sensor.notes.append(

@@ -750,9 +750,9 @@ def test_sigmas_of_a_correction_are_as_good_as_its_control(scene, tmp_path, caps
     g = model.direct(u, v, rng.uniform(100, 900, 60))
     noise, means = rng.normal(size=(2, 60)), {}
 
-    def sigma_with(noise_px, *options):
+    def sigma_with(noise_px, *options, points=60):
         control, target = tmp_path / "control.csv", tmp_path / "s.tif"
-        places = zip(g.tolist(), v + noise_px * noise[0], u + noise_px * noise[1], strict=True)
+        places = list(zip(g.tolist(), v + noise_px * noise[0], u + noise_px * noise[1], strict=True))[:points]
         rows = [f"{np.degrees(lon):.10f},{np.degrees(lat):.10f},{h},{x},{y}" for (lat, lon, h), x, y in places]
         control.write_text("\n".join(["lon_deg,lat_deg,height_m,column,row", *rows, ""]))
         args = ["--dem", str(dem), "--dem-datum", "0", "--control", str(control), "--sigma", str(target), *options]
@@ -770,6 +770,11 @@ def test_sigmas_of_a_correction_are_as_good_as_its_control(scene, tmp_path, caps
     stated, notes = sigma_with(0.1, "--pixel-sigma", "0.5")
     assert not any("as good as it fits" in note for note in notes)
     assert stated > 4.0 * means[0.1]
+    # four points have two observations too many, which fit by chance
+    few, notes = sigma_with(0.1, points=4)
+    assert any("few points do not tell (0.5 px)" in note for note in notes)
+    assert few == pytest.approx(sigma_with(0.0, points=4)[0], rel=0.01)
+    assert few > 10.0 * means[0.1] and sigma_with(3.0, points=4)[0] > 1.5 * few
 
 
 # -- what is said of bad input -------------------------------------------------------------------------------------
