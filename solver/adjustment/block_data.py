@@ -164,4 +164,25 @@ def network_from_block(block: BlockData) -> Network:
         Control(index[~check], block.ground.xyz_l[~check], sigma[~check]),
         Control(index[check], block.ground.xyz_l[check], sigma[check]),
     )
-    return replace(network, heading=block.heading)
+    return replace(network, heading=block.heading, control=_where_it_lies(network, block.frame))
+
+
+def _where_it_lies(network: Network, frame: LocalFrame) -> Control:
+    """The control, with what is not given of a point as its rays have it.
+
+    The vertical leans away from that of the local frame by the distance from its origin: 10 km away X of a planimetric
+    point is 0.8 m off if its height is 500 m off, and so is a height by its X and Y.
+    """
+    control = network.control
+    given = np.isfinite(control.sigma_m)
+    some = np.flatnonzero(~given.all(axis=1) & given.any(axis=1) & (network.rays_per_point[control.point] >= 2))
+    if not len(some) or frame.crs == "local":
+        return control
+    stated, met = (
+        frame.to_crs(xyz_l, may_lie_outside=True)
+        for xyz_l in (control.xyz_l[some], network.where_rays_meet(control.point[some]))
+    )
+    known = np.isfinite(stated).all(axis=1) & np.isfinite(met).all(axis=1)
+    xyz_l = control.xyz_l.copy()
+    xyz_l[some[known]] = frame.from_crs(np.where(given[some], stated, met)[known])
+    return replace(control, xyz_l=xyz_l)

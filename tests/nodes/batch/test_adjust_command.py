@@ -16,9 +16,11 @@ from recording_file import write_recording
 
 from triline.nodes.cli import main
 from triline.nodes.cli.adjust import read_input
+from triline.nodes.formats.block_folder import read_block
 from triline.nodes.formats.block_messages import block_messages, not_carried
 from triline.nodes.recording.reader import RecordingReader
 from triline.schemas.units import place_columns
+from triline.solver.adjustment.block_data import network_from_block
 from triline.solver.camera.self_calibration import tls
 from triline.solver.camera.sensors import preset
 from triline.solver.geometry.frames import LocalFrame
@@ -106,6 +108,27 @@ def adjust(*words, capsys=None):
 
 def result_in(path):
     return json.loads((path / "result.json").read_text())
+
+
+@pytest.mark.parametrize("role", ["planimetric", "height"])
+def test_what_is_not_given_of_control_does_not_move_what_is(tmp_path, role):
+    """The vertical leans away from that of the local frame: half a kilometre of height was a decimetre of X here, and
+    would be eight 10 km away."""
+    write_block(tmp_path / "b")
+    frame = LocalFrame(49.0, 9.0, 0.0, "EPSG:32632")
+    block = replace(read_block(tmp_path / "b"), frame=frame)
+    ground = block.ground
+    far = int(np.argmax(np.linalg.norm(ground.xyz_l[:, :2], axis=1) * (np.array(ground.role) == "control")))
+    stated = frame.to_crs(ground.xyz_l)
+    stated[far] += (0.0, 0.0, -500.0) if role == "planimetric" else (300.0, -400.0, 0.0)
+    roles = (*ground.role[:far], role, *ground.role[far + 1 :])
+    moved = replace(block, ground=replace(ground, xyz_l=frame.from_crs(stated), role=roles))
+    network = network_from_block(moved)
+    k = int(np.flatnonzero(network.control.point == network.point_index[ground.id[far]])[0])
+    off = network.control.xyz_l[k] - ground.xyz_l[far]
+    given = np.isfinite(network.control.sigma_m[k])
+    assert np.abs(moved.ground.xyz_l[far] - ground.xyz_l[far])[given].max() > 0.03
+    assert np.abs(off[given]).max() < 0.01
 
 
 @needs_blocks
