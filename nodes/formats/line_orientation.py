@@ -185,5 +185,7 @@ def _rows(file: TextIO, part: OrientedLines, rows: slice, frame: LocalFrame, R_b
     stamps = (f"{strip},{n},{t // 10**9}.{t % 10**9:09d}," for n, t in zip(
         part.line[rows].tolist(), part.time_ns[rows].tolist(), strict=True))  # fmt: skip
     table = np.concatenate(columns, axis=1)
-    text = [start + form % tuple(row) for start, row in zip(stamps, table.tolist(), strict=True)]
-    file.writelines(text if np.isfinite(table).all() else (row.replace("nan", "") for row in text))
+    numbers = [form % tuple(row) for row in table.tolist()]
+    if not np.isfinite(table).all():  # the name of a strip may have these letters, too
+        numbers = [row.replace("nan", "") for row in numbers]
+    file.writelines(start + row for start, row in zip(stamps, numbers, strict=True))

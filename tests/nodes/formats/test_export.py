@@ -6,6 +6,7 @@ import csv
 import json
 import sqlite3
 import struct
+from dataclasses import replace
 from datetime import date
 
 import numpy as np
@@ -302,6 +303,17 @@ def test_names_with_quotes_and_commas_stay_in_their_column(tmp_path):
     with open(tmp_path / "points.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [(row["point"], row["Z_m"], row["role"]) for row in rows] == [(name, "3.0000", "tie") for name in names]
+
+
+def test_the_name_of_a_strip_may_have_the_letters_of_what_is_not_known(tmp_path):
+    """Where sigmas are not known their columns are empty; of the strip Hainan1 was left Hai1."""
+    lines = _lines("Hainan1")
+    unknown = replace(lines, covariance=np.full_like(lines.covariance, np.nan))
+    assert write_oriented_lines(tmp_path / "lines.csv", [unknown], FRAME) == 3
+    with open(tmp_path / "lines.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["strip"] for row in rows] == ["Hainan1"] * 3
+    assert all(row["sigma_X_m"] == row["sigma_kappa_deg"] == "" and float(row["X_m"]) >= 0.0 for row in rows)
 
 
 def test_points_that_never_became_final_are_told(tmp_path, capsys):
