@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ...solver.rectification.nine_pixels import PUBLISHED, ROUNDING, conditions, curve, iterations, outcomes
+from ..batch.json_values import plain
 from ..errors import UserError
 from ..formats.new_file import new_file, refuse_unless_file
 
@@ -49,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     if args.plot:
         _plot(Path(args.plot), args.seed)
     if args.json:
-        print(json.dumps({"sets": rows}, indent=2, default=str))
+        print(json.dumps({"sets": plain(rows)}, indent=2))
         return 0
     print(
         "condition numbers, Frobenius norm, parameters in units of what is known beforehand (the source's are unknown)"
