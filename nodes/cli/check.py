@@ -11,6 +11,7 @@ from pathlib import Path
 
 from ..bus.authority import CERTIFICATE
 from ..errors import UserError
+from ..formats.importable import refuse_importable
 from ..recording.reader import RecordingReader
 from ..recording.remote import RemotePath, path_of
 from ..recording.seal import verify
@@ -36,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     if args.recording.is_dir():
         return _check_folder(args)
+    refuse_importable(args.recording)
     if isinstance(args.recording, RemotePath) and args.authority is not None:
         raise UserError(
             f"{args.recording}: seals of recordings elsewhere are not looked at, wanted a file for --authority"

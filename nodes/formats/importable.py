@@ -24,7 +24,7 @@ def refuse_importable(path: Path) -> None:
         return
     target = "camera.json" if kind == "camera" else f"{path.stem}.mcap"
     command = f"triline import {shlex.quote(str(path))} -o {shlex.quote(target)}"
-    raise UserError(f"{path}: is a {KINDS[kind]}, wanted a recording: `{command}` makes one")
+    raise UserError(f"{path}: {KINDS[kind]}, wanted a recording: `{command}` makes one")
 
 
 def _is_mcap(path: Path) -> bool:

@@ -10,7 +10,14 @@ POSES = "time_s,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg\n" + "".
 
 @pytest.mark.parametrize(
     ("command", "made"),
-    [("info", "poses.csv"), ("process", "poses.csv"), ("adjust", "poses.csv"), ("adjust", "."), ("info", ".")],
+    [
+        ("info", "poses.csv"),
+        ("check", "poses.csv"),
+        ("process", "poses.csv"),
+        ("adjust", "poses.csv"),
+        ("adjust", "."),
+        ("info", "."),
+    ],
 )
 def test_importable_input_is_named_with_the_command(tmp_path, capsys, monkeypatch, command, made):
     monkeypatch.chdir(tmp_path)
