@@ -75,8 +75,12 @@ def is_block_folder(path: Path) -> bool:
     return path.is_dir() and any((path / name).is_file() for name in names)
 
 
-def read_block(folder: Path | str) -> BlockData:
+def read_block(folder: Path | str, with_lines: bool = False) -> BlockData:
     """Read a block folder into arrays in the local frame.
+
+    Parameters
+    ----------
+    with_lines : whether image lines come with it, in which tie points are matched: none need be measured then
 
     Raises
     ------
@@ -104,7 +108,8 @@ def read_block(folder: Path | str) -> BlockData:
     extra = [_name(*key) for key, trajectory in trajectories.items() if id(trajectory) not in used]
     notes.extend(f"trajectory.csv: strip {name!r} is not in strips.csv and was ignored" for name in extra)
     ground = known_points(ground_table, frame, notes)
-    point_ids, image = _image_points(folder / "image_points.csv", camera, strips, ground, apriori, notes)
+    image_table = read_table(folder / "image_points.csv", _IMAGE, notes, may_be_empty=with_lines)
+    point_ids, image = _image_points(image_table, camera, strips, ground, apriori, notes)
     return BlockData(name, frame, camera, strips, point_ids, ground, image, apriori, tuple(notes))
 
 
@@ -385,9 +390,9 @@ def _shown(value: float) -> str:
 
 
 def _image_points(
-    path: Path, camera: LineCamera, strips: tuple[Strip, ...], ground: KnownPoints, apriori: Apriori, notes: list[str]
-) -> tuple[tuple[str, ...], ImagePoints]:
-    table = read_table(path, _IMAGE, notes)
+    table: Table, camera: LineCamera, strips: tuple[Strip, ...], ground: KnownPoints, apriori: Apriori,
+    notes: list[str],
+) -> tuple[tuple[str, ...], ImagePoints]:  # fmt: skip
     ids: dict[str, int] = {id: i for i, id in enumerate(ground.id)}
     point = _codes(table["point"], lambda id: ids.setdefault(id, len(ids)))
     ccd = _codes(table["ccd"], lambda id: camera.line_index.get(id, -1))

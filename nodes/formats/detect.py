@@ -206,7 +206,8 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
     kind = kind_of_path(path) if kind is None else kind
     options = Options() if options is None else options
     if kind in ("block", "scenes"):
-        block = read_block(path) if kind == "block" else local_block(read_scene_block(path))
+        lines = options.lines is not None
+        block = read_block(path, lines) if kind == "block" else local_block(read_scene_block(path, lines))
         notes, messages = [*block.notes, *not_carried(block)], block_messages(block)
         if options.lines is not None:
             with_images = with_scene_images if kind == "scenes" else with_block_images

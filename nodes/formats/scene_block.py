@@ -221,8 +221,13 @@ def is_scene_block(folder: Path) -> bool:
         return False
 
 
-def read_scene_block(folder: Path) -> SceneBlockData:
+def read_scene_block(folder: Path, with_lines: bool = False) -> SceneBlockData:
     """Read a block of satellite scenes.
+
+    Parameters
+    ----------
+    with_lines : whether image lines come with it, in which tie points are matched: none need be measured then, and
+        scenes without image points take part, too
 
     Raises
     ------
@@ -244,12 +249,14 @@ def read_scene_block(folder: Path) -> SceneBlockData:
     images = _images(scenes)
     ellipsoid = _ellipsoid(folder, images)
     ground, frame = _ground(folder, crs, ellipsoid, notes)
-    ids, rays = _image_points(folder, images, ground, sigma, notes)
-    used = np.unique(rays.image)
-    unused = [image.name for k, image in enumerate(images) if k not in used]
-    notes.extend(f"image {image}: no image points; it takes no part" for image in unused)
-    images = tuple(images[k] for k in used)
-    rays = replace(rays, image=np.searchsorted(used, rays.image))
+    image_table = read_table(folder / "image_points.csv", _IMAGE, notes, may_be_empty=with_lines)
+    ids, rays = _image_points(image_table, images, ground, sigma, notes)
+    if not with_lines:
+        used = np.unique(rays.image)
+        unused = [image.name for k, image in enumerate(images) if k not in used]
+        notes.extend(f"image {image}: no image points; it takes no part" for image in unused)
+        images = tuple(images[k] for k in used)
+        rays = replace(rays, image=np.searchsorted(used, rays.image))
     return SceneBlockData(name, frame, images, ids, rays, ground, settings, then, rpc, ellipsoid, sigma, tuple(notes))
 
 
@@ -343,9 +350,8 @@ def _ground(folder: Path, crs: str, ellipsoid: Ellipsoid, notes: list[str]) -> t
 
 
 def _image_points(
-    folder: Path, images: tuple[ImageEntry, ...], ground: KnownPoints, sigma_px: float, notes: list[str]
+    table: Table, images: tuple[ImageEntry, ...], ground: KnownPoints, sigma_px: float, notes: list[str]
 ) -> tuple[tuple[str, ...], ImagePoints]:
-    table = read_table(folder / "image_points.csv", _IMAGE, notes)
     place = {(image.scene.name, image.ccd): k for k, image in enumerate(images)}
     only = {}  # where a scene has one line of detectors its name need not be written
     for k, image in enumerate(images):
@@ -387,8 +393,8 @@ def _image_points(
     if twice.any():
         notes.append(f"image_points.csv: {twice.sum()} rows repeat a measurement and were left out")
         rows = rows[~twice]
-    if not len(rows):
-        raise UserError(f"{table.path}: no row that can be used; the first: {unusable[0] if unusable else 'none'}")
+    if not len(rows) and unusable:
+        raise UserError(f"{table.path}: no row that can be used; the first: {unusable[0]}")
     ids: dict[str, int] = {id: k for k, id in enumerate(ground.id)}
     point = np.array([ids.setdefault(str(id), len(ids)) for id in table["point"][rows]], dtype=np.int64)
     sigma = np.full(len(rows), sigma_px)

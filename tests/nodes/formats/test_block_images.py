@@ -87,3 +87,16 @@ def test_a_single_strip_needs_no_name_and_missing_ones_are_told(block, tmp_path,
     one = write_files(tmp_path / "one")
     assert main(["import", str(one), "--lines", f"N={tmp_path / 'n1.img'}", "-o", str(out), "-q"]) == 0
     assert len(list(RecordingReader(out).messages(["sensor/lines/N"]))) > 90
+
+
+def test_where_lines_come_no_image_point_need_be_measured(block, tmp_path, capsys):
+    """The matcher finds tie points in them; a table with a header alone was refused."""
+    out = tmp_path / "o.mcap"
+    (block / "image_points.csv").write_text(POINTS.splitlines()[0] + "\n")
+    assert main(["import", str(block), "--lines", f"S1/N={tmp_path / 'n1.img'}", "-o", str(out), "-q"]) == 0
+    reader = RecordingReader(out)
+    assert list(reader.messages(["sensor/lines/N"])) and list(reader.messages(["observation/control"]))
+    assert not list(reader.messages(["observation/tie"]))
+    out.unlink(), capsys.readouterr()
+    assert main(["import", str(block), "-o", str(out)]) == 1
+    assert "image_points.csv: no rows below the header, wanted at least one" in capsys.readouterr().err

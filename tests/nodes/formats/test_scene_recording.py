@@ -228,6 +228,24 @@ def test_pictures_of_scenes(pictures, tmp_path, capsys):
         assert (image.read(1) > 0).sum() > 25_000
 
 
+@pytest.mark.parametrize("kept", ["", "scene,F,"], ids=["none", "in one lens"])
+def test_pictures_need_no_image_points(kept, pictures, tmp_path, capsys):
+    """As `triline new scenes` leaves the table; it was refused, and a lens without points was not one of the block."""
+    folder, made, out = tmp_path / "pair", tmp_path / "pair.mcap", tmp_path / "out.mcap"
+    shutil.copytree(pictures / "pair", folder)
+    header, *rows = (folder / "image_points.csv").read_text().splitlines()
+    left = [row for row in rows if kept and kept in row]
+    (folder / "image_points.csv").write_text("\n".join([header, *left, ""]))
+    lines = f"scene/F={pictures / 'F.tif'},scene/B={pictures / 'B.tif'}"
+    assert main(["import", str(folder), "--lines", lines, "-o", str(made), "-q"]) == 0
+    (tmp_path / "dgr.toml").write_text('[adjuster]\nmodel = "dgr"\n')
+    nodes = ["--nodes", "matcher,adjuster", "--config", str(tmp_path / "dgr.toml")]
+    assert main(["process", "-q", str(made), *nodes, "-o", str(out)]) == 0
+    assert main(["export", str(out), "--points", str(tmp_path / "points.csv")]) == 0
+    points = (tmp_path / "points.csv").read_text().splitlines()
+    assert sum("-M" in row.split(",")[0] for row in points) > 40
+
+
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 def test_grey_values_that_do_not_fit_are_told(pictures, tmp_path, capsys):
     """As of the images of a flight."""
