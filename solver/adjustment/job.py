@@ -383,7 +383,8 @@ class _Stage:
             self._reweigh()
         if last and job.eliminates and self.solution.layout.n_camera:
             self.tell(Phase("determinability of the additional parameters"))
-            outcome = eliminate(self.solution, job.limits, job.on_the_way, self._adapt, self.tell)
+            image = self.scales.factor["image"]
+            outcome = eliminate(self.solution, job.limits, job.on_the_way, self._adapt, self.tell, image)
             self.removed, self.kept = outcome.removed, outcome.kept
             self._keep(outcome.solution)
             if job.snoop:

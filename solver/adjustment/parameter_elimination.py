@@ -14,6 +14,7 @@ from .determinability import Evidence, Limits, Removal, examine, point_sigmas, r
 from .network import Network
 from .network_weakness import PART, describe
 from .problem import NOTHING_ASSUMED, Assumed, assumed_of_model, with_left_out
+from .variance_components import scaled
 
 #: Least pivot of a parameter that is taken out of the cofactors, which lose as many digits. Tuned: it is a matter of
 #: rounding.
@@ -194,6 +195,7 @@ def eliminate(
     options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008  (frozen)
     adapt: Callable[[Problem], Problem] = lambda problem: problem,
     progress: Callable[[Removal], None] | None = None,
+    image_factor: float = 1.0,
 ) -> Elimination:
     """Remove parameters that are not determinable, one at a time, the worst first.
 
@@ -206,6 +208,7 @@ def eliminate(
     limits, options : critical values; how to iterate
     adapt : what was done to the a-priori weights of the problem, for the problems posed anew
     progress : called with every removal
+    image_factor : what the sigmas of the image points were multiplied by, which weights that are taken anew need
     """
     removed: list[Removal] = []
     kept: dict[str, str] = {}
@@ -225,12 +228,16 @@ def eliminate(
             known = known.without(verdict.removal.name)
         if not gone:
             break
-        solution = without(left, gone, options, adapt)
+        solution = without(left, gone, options, adapt, image_factor)
     return Elimination(solution, tuple(removed), kept)
 
 
 def without(
-    left: Reduced, gone: Sequence[str], options: AdjustmentOptions, adapt: Callable[[Problem], Problem]
+    left: Reduced,
+    gone: Sequence[str],
+    options: AdjustmentOptions,
+    adapt: Callable[[Problem], Problem],
+    image_factor: float,
 ) -> Solution:
     """The adjustment without some additional parameters, from the values of what is left."""
     old = left.solution.problem
@@ -245,7 +252,8 @@ def without(
     weight = left.solution.ray_weight
     found = solve(problem, start, weight, options)
     # places and weights of the rays are those of the start; once more where they are now
-    return solve(found.problem, found.state, weight, options)
+    found = solve(found.problem, found.state, weight, options)
+    return found if image_factor == 1.0 else scaled(found, {"image": image_factor}, options)
 
 
 def own_information(solution: Solution) -> Array:

@@ -1,11 +1,14 @@
 """Parameters taken out of the cofactors one after another, against the network adjusted anew without each."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from adjustment_networks import CAMERA, simulate
 
 from triline.solver.adjustment.adjustment import AdjustmentOptions, pose_problem, solve
 from triline.solver.adjustment.determinability import Limits, examine
+from triline.solver.adjustment.job import Job, run
 from triline.solver.adjustment.parameter_elimination import Reduced, eliminate
 from triline.solver.camera.self_calibration import tls
 from triline.solver.models.dgr import DgrOptions
@@ -83,3 +86,17 @@ def test_what_the_model_leaves_out_counts_once_however_many_parameters_go():
     assert found.removed
     noise = found.solution.network.rays.orientation_noise
     np.testing.assert_allclose(noise, plain.network.rays.orientation_noise, rtol=1e-9, atol=1e-18)
+
+
+@pytest.mark.parametrize("stated", [1.0 / 3.0, 3.0])
+@pytest.mark.parametrize(
+    "asked", [{"reweight": True}, {"reweight": True, "snoop": True}, {"components": True, "snoop": True}], ids=str
+)
+def test_an_image_sigma_that_was_estimated_holds_when_parameters_go(full, asked, stated):
+    """The problem posed anew had the a-priori one: sigma0 was 3 and a third, and sigma0 in pixels as much too large."""
+    rays = full.network.rays
+    wrong = replace(rays, sigma_line_px=stated * rays.sigma_line_px, sigma_sample_px=stated * rays.sigma_sample_px)
+    result = run(replace(full.network, rays=wrong), Job(MODEL, self_calibration=PARAMETERS, **asked))
+    assert len(result.removed) > 6
+    assert result.image_factor == pytest.approx(1.0 / stated, rel=0.05)
+    assert result.solution.sigma0 == pytest.approx(1.0, abs=0.03)
