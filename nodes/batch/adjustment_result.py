@@ -461,9 +461,10 @@ def _test_notes(adjustment: Adjustment) -> list[str]:
     result, critical = adjustment.result, adjustment.job.critical
     network, notes = result.network, []
     if result.given_up:
+        robust = "" if adjustment.job.robust else "a robust start (--robust danish), "
         notes.append(
             f"data snooping would leave out {100 * result.given_up:.0f} % of the image points: model or a-priori sigma "
-            "does not fit, so nothing was left out; a richer model (ppm, lim) or --reweight may help"
+            f"does not fit, so nothing was left out; {robust}a richer model (ppm, lim) or --reweight may help"
         )
     elif not adjustment.job.snoop:
         failing = int((result.rays.largest_w[result.solution.ray_weight > 0] > critical).sum())
@@ -517,6 +518,8 @@ def where_to_look(adjustment: Adjustment) -> str:
               if (network.rays.strip == i).any()}  # fmt: skip
     worst = max(median, key=lambda id: median[id])
     said = f"residuals are largest in strip {worst}, {median[worst]:.0f} px: check its trajectory and line times"
+    if adjustment.job.robust is None:
+        said += ", or, where many image points are wrong, adjust with --robust danish"
     far = _far_control(network)
     return f"{far}; {said}" if far else said
 

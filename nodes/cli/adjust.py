@@ -522,10 +522,9 @@ def adjust_block(
         if isinstance(tell, _ProgressLines):
             tell.close()
     adjustment = Adjustment(block, job, result, time.perf_counter() - start)
-    if not result.solution.converged and result.test.sigma0 > HOPELESS:
-        raise UserError(
-            f"{block.name}: does not converge (sigma0 {result.test.sigma0:.3g}); {where_to_look(adjustment)}"
-        )
+    sigma0 = result.test.sigma0 * result.image_factor  # of the image sigma that was stated, not of what was made of it
+    if not result.solution.converged and sigma0 > HOPELESS:
+        raise UserError(f"{block.name}: does not converge (sigma0 {sigma0:.3g}); {where_to_look(adjustment)}")
     return adjustment
 
 

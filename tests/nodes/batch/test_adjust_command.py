@@ -740,7 +740,10 @@ def test_block_that_does_not_fit_at_all_is_refused_with_the_strip_to_blame(folde
     trajectory.loc[trajectory.strip == "S2", "kappa_deg"] += 90.0
     trajectory.to_csv(turned / "trajectory.csv", index=False)
     message = refusal(capsys, turned, "-q")
-    assert "does not converge" in message and "strip S2" in message
+    assert "does not converge" in message and "strip S2" in message and "--robust danish" in message
+    # the image sigma becomes as large as it must be, and sigma0 is small beside it
+    assert "does not converge" in refusal(capsys, turned, "-q", "--variance-components")
+    assert "--robust danish" not in refusal(capsys, turned, "-q", "--robust", "danish")
 
 
 @pytest.mark.parametrize(
