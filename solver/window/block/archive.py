@@ -116,12 +116,13 @@ class Archive:
         kept = self.strips.get(strip.id)
         if kept is not None:
             kept.entered, kept.constants = strip.entered, strip.constants()
-            apriori = strip.apriori()
-            for begin in range(0, len(apriori[0]), PRIOR_TOGETHER):
-                columns, coefficients, value, sigma = (part[begin : begin + PRIOR_TOGETHER] for part in apriori)
-                numbers = np.unique(columns[columns >= 0]).astype(np.int64)
-                places = np.where(columns >= 0, np.searchsorted(numbers, columns), -1).astype(np.int32)
-                prior = whiten_prior(PseudoObservations(places, coefficients, value, sigma, ()), len(numbers))
+            columns, coefficients, value, sigma = strip.apriori()
+            for begin in range(0, len(columns), PRIOR_TOGETHER):
+                rows = slice(begin, begin + PRIOR_TOGETHER)
+                numbers = np.unique(columns[rows][columns[rows] >= 0]).astype(np.int64)
+                places = np.where(columns[rows] >= 0, np.searchsorted(numbers, columns[rows]), -1).astype(np.int32)
+                stated = PseudoObservations(places, coefficients[rows], value[rows], sigma[rows], ())
+                prior = whiten_prior(stated, len(numbers))
                 self.add(numbers, prior.normal.toarray(), prior.matrix.T @ prior.value)
 
     def restate_constants(self, factor: Array) -> None:
