@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 import time
+from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...schemas.image_lines import LineBlock
 from ...solver.camera.line_camera import LineCamera
-from ..convert import SECOND_NS, STRIP_SILENT_S
+from ..convert import LATEST_S, SECOND_NS, STRIP_SILENT_S
 from ..errors import UserError
 from ..formats.envi import header_integer, header_of, read_header
 from ..formats.envi_image import TYPES
@@ -36,6 +37,10 @@ _ENVI = {1: "u1", 12: "u2"}
 _BLOCK_NAME = re.compile(r"(?:(?P<strip>[^_]+)_)?(?P<ccd>[^_]+)_(?P<first>\d+)_(?P<time>\d{15,19})\.raw")
 #: Most lines of a block where a file has grown by many at once.
 _MOST_LINES = 4096
+#: In place of the time of a line that nobody knows.
+NO_TIME = -1
+#: A time that is later than that of the line before by more, ns, is believed with so many lines in a row.
+JUMP_NS, JUMP_LINES = SECOND_NS, 5
 
 
 @dataclass(frozen=True)
@@ -206,20 +211,35 @@ class GrowingImage:
 
 
 class GrowingTimes:
-    """UTC of lines from a CSV ``line,time`` or ``line,time_s`` that grows with the image."""
+    """UTC of lines from a CSV ``line,time`` or ``line,time_s`` that grows with the image.
 
-    def __init__(self, path: Path) -> None:
+    A row that cannot be used, or whose time does not go on, leaves its line without a time. Times that jump ahead are
+    believed when `JUMP_LINES` lines in a row have gone on from there.
+
+    Parameters
+    ----------
+    problem : counts rows that are not used: kind, text
+
+    Attributes
+    ----------
+    time_ns : of each line so far, ns; `NO_TIME` of a line without one
+    """
+
+    def __init__(self, path: Path, problem: Callable[[str, str], None]) -> None:
         self.path = path
+        self._problem = problem
         self._position = self._row = 0
         self._column = ""
-        self.time_ns: list[int] = []
+        self._next = 0  # line that the next row is to be of
+        self._ahead: list[_Row] = []  # with times that have jumped, not yet believed
+        self.time_ns = array("q")
 
     def read(self) -> None:
         """Take in what has been added.
 
         Raises
         ------
-        UserError : ``file:line: what is wrong``
+        UserError : ``file:line: what is wrong`` with the header
         """
         if not self.path.is_file():
             return
@@ -228,15 +248,23 @@ class GrowingTimes:
             data = file.read()
         whole = data.rfind(b"\n") + 1
         self._position += whole
-        new: list[tuple[str, str]] = []  # where it stands, and the time as it is written
+        new: list[tuple[int, str, str]] = []  # line, where it stands, and the time as it is written
         for text in data[:whole].decode("utf-8-sig", "replace").splitlines():
             self._row += 1
             if text.strip():
-                new += self._cells(text, len(self.time_ns) + len(new))
-        self._take(new)
+                new += self._cells(text)
+        for row in self._times(new):
+            self._take(row)
 
-    def _cells(self, text: str, line: int) -> list[tuple[str, str]]:
-        """Where the time of a line stands and how it is written; none in the header."""
+    def of(self, first: int, most: int) -> list[int]:
+        """Times of the lines from one on that have times, ns, or `NO_TIME` of those that have none."""
+        times = np.array(self.time_ns[first : first + most], dtype=np.int64)
+        known = times != NO_TIME
+        other = np.flatnonzero(known != known[:1])
+        return times[: other[0] if len(other) else None].tolist()
+
+    def _cells(self, text: str) -> list[tuple[int, str, str]]:
+        """Line, where it stands and how its time is written; none in the header, and of a row that is not used."""
         where = f"{self.path}:{self._row}"
         cells = [cell.strip() for cell in text.split(",")]
         if not self._column:
@@ -244,26 +272,70 @@ class GrowingTimes:
                 raise UserError(f"{where}: {text.strip()[:40]!r}, wanted the columns line,time or line,time_s")
             self._column = cells[1]
             return []
-        if len(cells) != 2 or cells[0] != str(line):
-            raise UserError(f"{where}: {text.strip()[:40]!r}, wanted line {line} and its time")
-        return [(where, cells[1])]
+        line = int(cells[0]) if len(cells) == 2 and cells[0].isdecimal() else -1
+        if line != self._next:
+            self._refuse(f"{where}: {text.strip()[:40]!r}, wanted line {self._next} and its time")
+            if not self._next < line < self._next + _MOST_LINES:
+                return []
+        self._next = line + 1
+        return [(line, where, cells[1])]
 
-    def _take(self, new: list[tuple[str, str]]) -> None:
+    def _times(self, new: list[tuple[int, str, str]]) -> list[_Row]:
+        """The rows whose times can be read."""
+        try:
+            return self._read_times(new)
+        except UserError:
+            rows = []
+            for entry in new:
+                try:
+                    rows += self._read_times([entry])
+                except UserError as error:
+                    self._refuse(str(error))
+            return rows
+
+    def _read_times(self, new: list[tuple[int, str, str]]) -> list[_Row]:
         if not new:
-            return
+            return []
         if self._column == "time_s":
-            times = [_seconds_ns(*entry) for entry in new]
+            times = [_seconds_ns(where, text) for _, where, text in new]
         else:  # all at once: pandas takes a millisecond for a single one
-            times = instants_ns([text for _, text in new], lambda i: new[i][0]).tolist()
-        for (where, text), time_ns in zip(new, times, strict=True):
-            if self.time_ns and time_ns <= self.time_ns[-1]:
-                raise UserError(f"{where}: {text!r} does not come after the line before it")
-            self.time_ns.append(time_ns)
+            times = instants_ns([text for *_, text in new], lambda i: new[i][1]).tolist()
+        return [_Row(line, t, f"{where}: {text!r}") for (line, where, text), t in zip(new, times, strict=True)]
+
+    def _take(self, row: _Row) -> None:
+        """The time of a line, if it goes on from that of the line before."""
+        newest_ns = self.time_ns[-1] if self.time_ns else None
+        if newest_ns is not None and row.time_ns <= newest_ns:
+            self._refuse(f"{row.shown} does not come after the line before it")
+            return
+        if self._ahead and row.time_ns <= self._ahead[-1].time_ns:
+            for ahead in self._ahead:
+                self._refuse(f"{ahead.shown} is ahead of the lines after it")
+            self._ahead.clear()
+        self._ahead.append(row)
+        if newest_ns is not None and self._ahead[0].time_ns - newest_ns > JUMP_NS and len(self._ahead) < JUMP_LINES:
+            return
+        for known in self._ahead:
+            self.time_ns.extend([NO_TIME] * (known.line - len(self.time_ns)))
+            self.time_ns.append(known.time_ns)
+        self._ahead.clear()
+
+    def _refuse(self, text: str) -> None:
+        self._problem("lines without a time", text)
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """A row of line times: line, its time, where and how it is written."""
+
+    line: int
+    time_ns: int
+    shown: str
 
 
 def _seconds_ns(where: str, text: str) -> int:
     whole, _, fraction = text.partition(".")
-    if not whole.isdigit() or (fraction and not fraction.isdigit()):
+    if not whole.isdecimal() or (fraction and not fraction.isdecimal()) or int(whole) > LATEST_S:
         raise UserError(f"{where}: {text!r}, wanted seconds since the Unix epoch")
     return int(whole) * SECOND_NS + int((fraction + "0" * 9)[:9])
 
@@ -290,7 +362,7 @@ class LineFiles(Sensor):
     def _growing(self, stop: Event) -> Iterator[Message | None]:
         s = self._settings
         images = {ccd: GrowingImage(path, band, s.samples, s.kind) for ccd, (path, band) in s.images.items()}
-        times = GrowingTimes(s.line_times) if s.line_times is not None else None
+        times = GrowingTimes(s.line_times, self.problem) if s.line_times is not None else None
         most = min(max(round(BLOCK_S * s.rate_hz), 1), _MOST_LINES)
         silent = Silence(stop)
         try:
@@ -299,13 +371,17 @@ class LineFiles(Sensor):
                 if times is not None:
                     times.read()
                 for ccd, image in images.items():
-                    room = most if times is None else min(most, len(times.time_ns) - image.lines)
                     first = image.lines
+                    known = None if times is None else times.of(first, most)
+                    room = most if known is None else len(known)
                     pixels = image.read(room) if room > 0 else None
                     if pixels is None:
                         continue
                     came = True
-                    known = None if times is None else times.time_ns[first : first + len(pixels)]
+                    if known is not None:
+                        known = known[: len(pixels)]
+                        if known[0] == NO_TIME:
+                            continue
                     yield from self._lines(s.strip, ccd, first, pixels, self._first_ns(first, known), known)
                 if not came:
                     yield None

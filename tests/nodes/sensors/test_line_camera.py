@@ -89,7 +89,7 @@ def test_line_times_in_words_come_as_fast_as_lines(tmp_path):
     times = T + np.arange(4000, dtype=np.int64) * 1_000_123
     words = np.datetime_as_string(times.astype("datetime64[ns]"))
     (tmp_path / "times.csv").write_text("line,time\n" + "".join(f"{i},{w}Z\n" for i, w in enumerate(words)))
-    read_in = GrowingTimes(tmp_path / "times.csv")
+    read_in = GrowingTimes(tmp_path / "times.csv", pytest.fail)
     begun = time.process_time()
     read_in.read()
     assert time.process_time() - begun < 1.0
@@ -200,10 +200,6 @@ def test_headers_that_cannot_be(tmp_path, keys, wanted):
     ("text", "wanted"),
     [
         ("a,b\n0,1\n", "times.csv:1: 'a,b', wanted the columns line,time or line,time_s"),
-        ("line,time_s\n1,5\n", "times.csv:2: '1,5', wanted line 0 and its time"),
-        ("line,time_s\n0,x\n", "times.csv:2: 'x', wanted seconds since the Unix epoch"),
-        ("line,time\n0,x\n", "times.csv:2: 'x', wanted an ISO 8601 time"),
-        ("line,time_s\n0,7\n1,7\n", "times.csv:3: '7' does not come after the line before it"),
     ],
 )
 def test_line_times_that_cannot_be(tmp_path, text, wanted):
@@ -212,3 +208,56 @@ def test_line_times_that_cannot_be(tmp_path, text, wanted):
     with pytest.raises(UserError) as error:
         read(LineFiles(settings(tmp_path, images={"N": "n.raw"}, line_times="times.csv")), 1)
     assert wanted in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("column", "rows", "without", "wanted"),
+    [
+        ("time_s", {8: "8,6.95", 9: "9,6.96"}, (8, 9), "times.csv:11: '6.96' does not come after the line before it"),
+        ("time_s", {8: "8,3600", 9: "9,3601"}, (8, 9), "times.csv:11: '3601' is ahead of the lines after it"),
+        ("time_s", {0: "0,x"}, (0,), "times.csv:2: 'x', wanted seconds since the Unix epoch"),
+        ("time_s", {3: "3,99999999999"}, (3,), "times.csv:5: '99999999999', wanted seconds since the Unix epoch"),
+        ("time", {8: "8,noon"}, (8,), "times.csv:10: 'noon', wanted an ISO 8601 time"),
+        ("time_s", {8: "", 12: "2,7"}, (8, 12), "times.csv:15: '13,7.130000000', wanted line 12 and its time"),
+        ("time_s", {8: "-,-,-"}, (8,), "times.csv:11: '9,7.090000000', wanted line 8 and its time"),
+    ],
+)
+def test_lines_without_a_time_are_left_out_and_the_camera_goes_on(tmp_path, column, rows, without, wanted):
+    """A clock that goes back for a moment ended the program, and again when it was started anew."""
+    (tmp_path / "n.raw").write_bytes(IMAGE[:, 0].tobytes())
+    times = 7_000_000_000 + np.arange(40, dtype=np.int64) * 10_000_000
+    words = np.datetime_as_string(times.astype("datetime64[ns]"))
+    written = [f"{t // 10**9}.{t % 10**9:09d}" for t in times] if column == "time_s" else [f"{w}Z" for w in words]
+    whole = [rows.get(i, f"{i},{text}") for i, text in enumerate(written)]
+    path = tmp_path / "times.csv"
+    path.write_text("\n".join([f"line,{column}", *whole[:9]]) + "\n")  # the rest when that has been read
+    sensor = LineFiles(settings(tmp_path, images={"N": "n.raw"}, line_times="times.csv"))
+    stop, blocks, waits = threading.Event(), [], 0
+    for message in sensor.messages(stop):
+        if message is None:
+            waits += 1
+            if waits == 1:
+                path.write_text("\n".join([f"line,{column}", *whole]) + "\n")
+        elif message.topic == "sensor/lines/N":
+            blocks.append(message.body)
+        if waits == 3:
+            stop.set()
+    left = np.delete(np.arange(40), without)
+    lines = np.concatenate([b.first_line + np.arange(len(b.pixels)) for b in blocks])
+    np.testing.assert_array_equal(lines, left)
+    np.testing.assert_array_equal(np.concatenate([b.pixels for b in blocks]), IMAGE[left, 0])
+    np.testing.assert_array_equal(np.concatenate([b.times_ns() for b in blocks]), times[left])
+    assert list(sensor.counters) == ["lines without a time"]
+    assert wanted in sensor.last_problem
+
+
+def test_lines_that_pause_go_on(tmp_path):
+    """A camera that stood still is not a clock that jumps: its times go on from there."""
+    (tmp_path / "n.raw").write_bytes(IMAGE[:, 0].tobytes())
+    times = T + np.arange(40) * 10_000_000 + (np.arange(40) > 11) * 90_000_000_000
+    text = "line,time_s\n" + "".join(f"{i},{t // 10**9}.{t % 10**9:09d}\n" for i, t in enumerate(times))
+    (tmp_path / "times.csv").write_text(text)
+    sensor = LineFiles(settings(tmp_path, images={"N": "n.raw"}, line_times="times.csv"))
+    blocks = [m for m in read(sensor, 5) if m.topic == "sensor/lines/N"]
+    np.testing.assert_array_equal(np.concatenate([m.body.times_ns() for m in blocks]), times)
+    assert not sensor.counters
