@@ -54,7 +54,10 @@ class NodeProcess:
                 return self.process.wait()
 
     def last_line(self) -> str:
-        """The last line it wrote, for messages about why it ended."""
+        """Why it ended: the last line it wrote, or what killed it."""
+        code = self.process.poll()
+        if code is not None and code < 0:
+            return f"killed by {signal.Signals(-code).name}"
         lines = self.log_path.read_text(errors="replace").strip().splitlines()
         return lines[-1] if lines else "no output"
 

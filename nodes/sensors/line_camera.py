@@ -41,6 +41,9 @@ _MOST_LINES = 4096
 NO_TIME = -1
 #: A time that is later than that of the line before by more, ns, is believed with so many lines in a row.
 JUMP_NS, JUMP_LINES = SECOND_NS, 5
+#: The end of a strip, known when nothing more has come, is stamped so long after the newest platform time, ns, that no
+#: node is past it when it comes.
+END_AHEAD_NS = SECOND_NS // 2
 
 
 @dataclass(frozen=True)
@@ -351,7 +354,7 @@ class LineFiles(Sensor):
         self._period_ns = round(SECOND_NS / settings.rate_hz)
         self._strips: dict[str, _Part] = {}  # of those not ended, by the name that the files give them
         self._times_begun: Counter[str] = Counter()
-        self._newest_s = 0.0
+        self._heard_s = 0.0  # when the last block came
 
     def messages(self, stop: Event) -> Iterator[Message | None]:
         yield from self._blocks(stop) if self._settings.folder is not None else self._growing(stop)
@@ -444,8 +447,8 @@ class LineFiles(Sensor):
     ) -> Iterator[Message]:
         """The block, after the announcement of a strip that begins with it."""
         clock, rate_hz = self._settings.clock, self._settings.rate_hz
-        if strip not in self._strips:
-            yield from self._end_strips()
+        self._heard_s = time.monotonic()
+        before = [] if strip in self._strips else self._take_strips()
         part = self._strips.get(strip) or self._begun(strip, first)
         missing = part.base - first  # of a CCD line that was behind the others when the strip ended
         if missing > 0:
@@ -459,6 +462,8 @@ class LineFiles(Sensor):
         message = block_message(
             clock, LineBlock(pixels, ccd, part.name, line, time_ns, 0 if known is not None else self._period_ns, times)
         )
+        for ended in before:
+            yield self._end(ended, message.stamp_ns)
         if part.newest_ns is None:
             part.first_ns, part.newest_ns = time_ns - round(line * SECOND_NS / rate_hz), message.stamp_ns
             yield strip_message(part.name, part.first_ns, rate_hz, message.stamp_ns)
@@ -475,10 +480,20 @@ class LineFiles(Sensor):
         return part
 
     def _end_strips(self) -> Iterator[Message]:
-        for part in self._strips.values():
-            if part.newest_ns is not None:
-                yield strip_message(part.name, part.first_ns, self._settings.rate_hz, part.newest_ns, part.lines)
+        """The ends of all strips, of which nothing more comes."""
+        since_ns = round((time.monotonic() - self._heard_s) * SECOND_NS)
+        for part in self._take_strips():
+            assert part.newest_ns is not None
+            yield self._end(part, part.newest_ns + since_ns + END_AHEAD_NS)
+
+    def _take_strips(self) -> list[_Part]:
+        """Strips that have lines and have ended now."""
+        ended = [part for part in self._strips.values() if part.newest_ns is not None]
         self._strips.clear()
+        return ended
+
+    def _end(self, part: _Part, stamp_ns: int) -> Message:
+        return strip_message(part.name, part.first_ns, self._settings.rate_hz, stamp_ns, part.lines)
 
 
 @dataclass

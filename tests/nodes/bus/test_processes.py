@@ -69,3 +69,15 @@ def test_a_recorder_that_still_writes_is_waited_for(tmp_path, portions):
     path.write_bytes(b"x")
     node = NodeProcess("recorder", Writing(), tmp_path / "recorder.log")
     assert node.stop(1.0, tmp_path) == (0 if portions else -9) and bool(killed) == (not portions)
+
+
+def test_a_process_that_was_killed_says_so(tmp_path):
+    """Its last line, of something else long before, was told as the reason."""
+    log = tmp_path / "cam.log"
+    log.write_text("cam: lines without a time: times.csv:607\n")
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    node = NodeProcess("cam", process, log)
+    assert node.last_line() == "cam: lines without a time: times.csv:607"
+    process.kill()
+    process.wait()
+    assert node.last_line() == "killed by SIGKILL"

@@ -123,6 +123,9 @@ def test_a_strip_that_goes_on_after_its_end_gets_another_name(tmp_path, monkeypa
         ("S7", False, 0), ("S7", True, 20), ("S7-2", False, 0), ("S7-2", True, 20)
     ]  # fmt: skip
     assert strips[2].first_line_time_ns == T + 20 * 10_000_000
+    # the end is known when nothing more has come for 0.3 s; stamped with the last line it came after its turn
+    stamp = next(m.stamp_ns for m in messages if m.topic == "configuration/strip" and m.body.ended)
+    assert 0.8 < (stamp - T - 19 * 10_000_000) * 1e-9 < 5.0
     later = [m.body for m in messages if m.topic.startswith("sensor") and m.body.strip == "S7-2"]
     for ccd, band in (("F", 0), ("N", 1)):
         of = [b for b in later if b.ccd == ccd]
@@ -150,6 +153,16 @@ def test_a_folder_of_blocks(tmp_path):
     assert [m.topic for m in messages[:3]] == ["configuration/strip", "sensor/lines/F", "sensor/lines/N"]
     assert messages[-1].body.ended and messages[-1].body.lines == 30
     assert dict(sensor.counters) == {"name of a block": 1, "size of a block": 1}
+
+
+def test_a_strip_that_another_one_ends_ends_at_the_first_lines_of_that(tmp_path):
+    folder = tmp_path / "blocks"
+    folder.mkdir()
+    (folder / f"A_N_000000_{T}.raw").write_bytes(IMAGE[:10, 1].tobytes())
+    (folder / f"B_N_000000_{T + 3_000_000_000}.raw").write_bytes(IMAGE[10:20, 1].tobytes())
+    *_, ended, begun, block, _ = read(LineFiles(settings(tmp_path, folder="blocks")), 5)
+    assert (ended.body.id, ended.body.ended, ended.body.lines) == ("A", True, 10)
+    assert ended.stamp_ns == begun.stamp_ns == block.stamp_ns == T + 3_090_000_000
 
 
 @pytest.mark.parametrize(
