@@ -7,6 +7,7 @@ import time
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
@@ -151,20 +152,27 @@ class GrowingImage:
     path : of the data; it may not be there yet
     band : from 0
     samples, kind : of a raw file; an ENVI header beside it says them itself
+    problem : counts what cannot be used: kind, text
 
     Raises
     ------
     UserError : while it is read: a header of another kind of image
     """
 
-    def __init__(self, path: Path, band: int, samples: int, kind: str) -> None:
-        self.path, self._band = path, band
+    def __init__(self, path: Path, band: int, samples: int, kind: str, problem: Callable[[str, str], None]) -> None:
+        self.path, self._band, self._problem = path, band, problem
         self._samples, self._kind, self._bands, self._offset = samples, TYPES[kind], 1, 0
         self._file: BinaryIO | None = None
+        self._over = False
         self.lines = 0  # given out
 
     def read(self, most: int) -> NDArray[Any] | None:
-        """The next lines that are whole, (n, samples); None where there is none yet."""
+        """The next lines that are whole, (n, samples); None where there is none yet.
+
+        Nothing more comes of a file that was begun anew: nobody knows when its lines were imaged.
+        """
+        if self._over:
+            return None
         if self._file is None:
             if not self.path.is_file():
                 return None
@@ -172,6 +180,12 @@ class GrowingImage:
         assert self._file is not None
         line_bytes = self._bands * self._samples * self._kind.itemsize
         whole = (self.path.stat().st_size - self._offset) // line_bytes - self.lines
+        if whole < 0:
+            self._over = True
+            self._problem(
+                "image begun anew",
+                f"{self.path} is shorter than the {self.lines} lines that were read of it: no more of it is used",
+            )
         count = min(whole, most)
         if count < 1:
             return None
@@ -364,7 +378,9 @@ class LineFiles(Sensor):
 
     def _growing(self, stop: Event) -> Iterator[Message | None]:
         s = self._settings
-        images = {ccd: GrowingImage(path, band, s.samples, s.kind) for ccd, (path, band) in s.images.items()}
+        images = {
+            ccd: GrowingImage(path, band, s.samples, s.kind, self.problem) for ccd, (path, band) in s.images.items()
+        }
         times = GrowingTimes(s.line_times, self.problem) if s.line_times is not None else None
         most = min(max(round(BLOCK_S * s.rate_hz), 1), _MOST_LINES)
         silent = Silence(stop)
@@ -372,12 +388,15 @@ class LineFiles(Sensor):
             while not stop.is_set():
                 came = False
                 if times is not None:
-                    times.read()
+                    with self._readable(times.path):
+                        times.read()
                 for ccd, image in images.items():
-                    first = image.lines
+                    first, pixels = image.lines, None
                     known = None if times is None else times.of(first, most)
                     room = most if known is None else len(known)
-                    pixels = image.read(room) if room > 0 else None
+                    if room > 0:
+                        with self._readable(image.path):
+                            pixels = image.read(room)
                     if pixels is None:
                         continue
                     came = True
@@ -413,8 +432,11 @@ class LineFiles(Sensor):
         if not s.samples:
             raise UserError(f"{s.folder}: samples of the lines missing, wanted samples = the pixels of a CCD line")
         while not stop.is_set():
-            found = []
-            for path in s.folder.iterdir() if s.folder.is_dir() else ():
+            found, came = [], False
+            names: list[Path] = []
+            with self._readable(s.folder):
+                names = list(s.folder.iterdir()) if s.folder.is_dir() else []
+            for path in names:
                 if path.name in done or path.suffix != ".raw":
                     continue
                 match = _BLOCK_NAME.fullmatch(path.name)
@@ -424,15 +446,20 @@ class LineFiles(Sensor):
                     continue
                 found.append((int(match["time"]), path, match))
             for time_ns, path, match in sorted(found, key=lambda entry: entry[:2]):
+                data, line_bytes = None, s.samples * TYPES[s.kind].itemsize
+                with self._readable(path):
+                    data = path.read_bytes()
+                if data is None:
+                    continue
+                came = True
                 done.add(path.name)
-                data, line_bytes = path.read_bytes(), s.samples * TYPES[s.kind].itemsize
                 if not data or len(data) % line_bytes:
                     self.problem("size of a block", f"{path.name}: {len(data)} bytes, wanted lines of {line_bytes}")
                     continue
                 pixels = pixels_of(data, s.samples, TYPES[s.kind])
                 strip = match["strip"] or s.strip
                 yield from self._lines(strip, match["ccd"], int(match["first"]), pixels, time_ns, None)
-            if not found:
+            if not came:
                 yield None
                 if silent.long():
                     yield from self._end_strips()
@@ -441,6 +468,14 @@ class LineFiles(Sensor):
                 silent.broken()
 
     # ---- both
+
+    @contextmanager
+    def _readable(self, path: Path) -> Iterator[None]:
+        """Count a file that cannot be read now, as on a disk of another machine; it is tried again."""
+        try:
+            yield
+        except OSError as error:
+            self.problem("not readable", f"{path}: {error.strerror.lower() if error.strerror else error}")
 
     def _lines(
         self, strip: str, ccd: str, first: int, pixels: NDArray[Any], time_ns: int, known: list[int] | None

@@ -155,6 +155,68 @@ def test_a_folder_of_blocks(tmp_path):
     assert dict(sensor.counters) == {"name of a block": 1, "size of a block": 1}
 
 
+def test_a_file_that_cannot_be_read_for_a_moment_is_read_later(tmp_path):
+    """As on a disk of another machine; the program ended as a fault of triline, and began again at the first line."""
+    (tmp_path / "n.raw").write_bytes(IMAGE[:20, 0].tobytes())
+    sensor = LineFiles(settings(tmp_path, images={"N": "n.raw"}, first_time=START))
+    lines, stop = 0, threading.Event()
+    for message in sensor.messages(stop):
+        if message is not None and message.topic.startswith("sensor"):
+            lines += len(message.body.pixels)
+        if lines == 20 and (tmp_path / "n.raw").exists():
+            (tmp_path / "n.raw").rename(tmp_path / "elsewhere")
+        elif sensor.counters["not readable"] and not (tmp_path / "n.raw").exists():
+            with (tmp_path / "elsewhere").open("ab") as file:
+                file.write(IMAGE[20:, 0].tobytes())
+            (tmp_path / "elsewhere").rename(tmp_path / "n.raw")
+        elif lines == 40:
+            stop.set()
+    assert list(sensor.counters) == ["not readable"]
+    assert sensor.last_problem == f"{tmp_path / 'n.raw'}: no such file or directory"
+
+
+def test_a_block_that_is_taken_away_or_cannot_be_read_does_not_end_the_program(tmp_path, monkeypatch):
+    folder = tmp_path / "blocks"
+    folder.mkdir()
+    for first in (0, 10, 20):
+        (folder / f"N_{first:06d}_{T + first * 10_000_000}.raw").write_bytes(IMAGE[first : first + 10, 1].tobytes())
+    read_bytes = Path.read_bytes
+
+    def read_but_one(path: Path) -> bytes:
+        if "_000010_" in path.name:
+            raise PermissionError(13, "Permission denied")
+        return read_bytes(path)
+
+    monkeypatch.setattr(Path, "read_bytes", read_but_one)
+    sensor = LineFiles(settings(tmp_path, folder="blocks"))
+    stop, begun, blocks = threading.Event(), time.monotonic(), []
+    for message in sensor.messages(stop):
+        if message is not None and message.topic.startswith("sensor"):
+            blocks.append(message.body)
+        if time.monotonic() > begun + 0.5:
+            stop.set()
+    assert [b.first_line for b in blocks] == [0, 20]
+    assert 1 < sensor.counters["not readable"] < 10  # tried again, and not without end
+
+
+def test_an_image_that_is_begun_anew_gives_no_more_lines(tmp_path):
+    """Its new lines had the times of those that it had held before, from where it was as long again."""
+    path = tmp_path / "n.raw"
+    path.write_bytes(IMAGE[:20, 0].tobytes())
+    sensor = LineFiles(settings(tmp_path, images={"N": "n.raw"}, first_time=START))
+    lines, waits, stop = 0, 0, threading.Event()
+    for message in sensor.messages(stop):
+        if message is None:
+            waits += 1
+            path.write_bytes(IMAGE[: 10 * waits, 0].tobytes())
+        elif message.topic.startswith("sensor"):
+            lines += len(message.body.pixels)
+        if waits == 4:
+            stop.set()
+    assert lines == 20 and dict(sensor.counters) == {"image begun anew": 1}
+    assert sensor.last_problem == f"{path} is shorter than the 20 lines that were read of it: no more of it is used"
+
+
 def test_a_strip_that_another_one_ends_ends_at_the_first_lines_of_that(tmp_path):
     folder = tmp_path / "blocks"
     folder.mkdir()
