@@ -17,6 +17,7 @@ from ..bus.processes import NodeGroup
 from ..convert import check_place
 from ..errors import UserError
 from ..monitor.sensor_watch import SensorWatch
+from ..ordering import MAX_JUMP_NS
 from .live_flight import DRAIN_S, ESTIMATORS, LiveFlight, add_view_arguments, seconds_between
 
 if TYPE_CHECKING:
@@ -82,8 +83,8 @@ class FirstData:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._ahead_ns: dict[str, int] = {}  # newest stamp of a topic minus the time at which it came
-        self.newest_ns = 0
+        self._ahead_ns: dict[str, int] = {}  # last stamp of a topic minus the time at which it came
+        self._last_ns: dict[str, int] = {}  # last stamps of `TIMED`
         self.place: tuple[float, float] | None = None
 
     def take(self, raw: RawMessage) -> None:
@@ -99,9 +100,20 @@ class FirstData:
         except ValueError:
             return
         with self._lock:
-            self.newest_ns = max(self.newest_ns, raw.envelope.stamp_ns)
+            self._last_ns[raw.topic] = raw.envelope.stamp_ns
             if raw.topic == "sensor/gnss" and self.place is None:
                 self.place = round(body.latitude, 6), round(body.longitude, 6)
+
+    @property
+    def newest_ns(self) -> int:
+        """How far time is, by what came last on each topic; 0 before anything has.
+
+        A clock far from that of GNSS does not count: nodes would wait for their configuration until its time has come.
+        """
+        with self._lock:
+            gnss_ns = self._last_ns.get("sensor/gnss")
+            near = [ns for ns in self._last_ns.values() if gnss_ns is None or abs(ns - gnss_ns) <= MAX_JUMP_NS]
+        return max(near, default=0)
 
     def apart(self) -> dict[str, str]:
         """A line for each sensor that is stamped by another clock than GNSS is."""

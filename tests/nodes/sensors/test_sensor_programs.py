@@ -239,6 +239,19 @@ def test_first_data():
     assert (first.newest_ns, first.place) == (T + 7, (48.123457, 9.0))
 
 
+def test_one_stamp_far_ahead_does_not_put_the_configuration_off():
+    """Configuration was stamped by it: no node had any until then, and the flight no result."""
+    first, year = FirstData(), 365 * 86400 * 10**9
+    attitude, inertial = encode(m.Attitude(time_ns=T)), encode(m.Imu(time_ns=T + year, force_z=-9.8))
+    first.take(RawMessage("sensor/attitude", Envelope(T + year, "a", 0), attitude))
+    first.take(RawMessage("sensor/attitude", Envelope(T + 7, "a", 1), attitude))
+    assert first.newest_ns == T + 7
+    fix = encode(gnss_message(T, (48.1, 9.0, 500.0), (1.0, 1.0, 2.0)))
+    first.take(RawMessage("sensor/gnss", Envelope(T + 5, "b", 0), fix))
+    first.take(RawMessage("sensor/imu", Envelope(T + year, "c", 0), inertial))  # a clock of its own
+    assert first.newest_ns == T + 7
+
+
 def test_clocks_that_are_apart_are_told():
     first = FirstData()
     fix = encode(gnss_message(T, (48.1, 9.0, 500.0), (1.0, 1.0, 2.0)))
