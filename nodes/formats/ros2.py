@@ -162,10 +162,10 @@ def fix_messages(
     source: str,
     left_out: Counter[str] | None = None,
 ) -> Iterator[Message]:
-    """``sensor/gnss`` of each NavSatFix in CDR; ``left_out`` counts, as they come, those that cannot be used."""
-    left_out = Counter() if left_out is None else left_out
+    """``sensor/gnss`` of each NavSatFix in CDR; ``left_out``, of a live topic, counts those that cannot be used."""
+    live, left_out = left_out is not None, Counter() if left_out is None else left_out
     nominal = 0
-    for time_ns, fix in decoded(payloads, FIX, left_out):
+    for time_ns, fix in decoded(payloads, FIX, left_out, live):
         variance = fix.position_covariance[_DIAGONAL]
         known = fix.position_covariance_type != 0 and np.isfinite(variance).all() and (variance > 0).all()
         place, sigma = (fix.latitude, fix.longitude, fix.altitude), np.sqrt(variance) if known else FIX_SIGMA_M
@@ -190,11 +190,11 @@ def inertial_messages(
 ) -> Iterator[Message]:
     """``sensor/imu`` and ``sensor/attitude`` of each Imu in CDR, so many ``at_once``.
 
-    A covariance that begins with -1 marks values that a message lacks. ``left_out`` counts, as they come, messages that
-    cannot be used. Messages do not say how long they measured: from the one before on, but not over lost ones.
+    A covariance that begins with -1 marks values that a message lacks. ``left_out``, of a live topic, counts messages
+    that cannot be used. Messages do not say how long they measured: from the one before on, but not over lost ones.
     """
-    left_out = Counter() if left_out is None else left_out
-    samples = decoded(payloads, IMU, left_out)
+    live, left_out = left_out is not None, Counter() if left_out is None else left_out
+    samples = decoded(payloads, IMU, left_out, live)
     last, nominal, steps = None, 0, deque[int](maxlen=_STEPS)
     while batch := list(islice(samples, at_once)):
         time_ns = [time for time, _ in batch]

@@ -69,13 +69,15 @@ class _Strip:
         )
 
 
-def image_rows(payloads: Iterable[bytes | memoryview], left_out: Counter[str]) -> Iterator[tuple[int, NDArray[Any]]]:
+def image_rows(
+    payloads: Iterable[bytes | memoryview], left_out: Counter[str], live: bool = False
+) -> Iterator[tuple[int, NDArray[Any]]]:
     """Stamp in ns and rows (height, width), uint8 or uint16, of each Image in CDR that is grey and whole.
 
     ``left_out`` counts the others by what is wrong with them. Images are as wide as the first one.
     """
     wanted = 0
-    for time_ns, image in decoded(payloads, IMAGE, left_out):
+    for time_ns, image in decoded(payloads, IMAGE, left_out, live):
         kind = _PIXELS.get(image.encoding)
         if kind is None:
             left_out["images that are not grey"] += 1

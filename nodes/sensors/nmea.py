@@ -22,6 +22,7 @@ from pynmeagps import GET, VALCKSUM, NMEAReader
 from ..convert import SECOND_NS, attitude_message, check_place, gnss_message
 from ..formats.keys import Keys
 from ..node import Message
+from ..ordering import REBASE_AFTER
 from .bytes_in import check_address, read_bytes
 from .program import Clock, Sensor, publish, refuse_unknown
 
@@ -98,6 +99,7 @@ class NmeaParser:
         self._rest = b""
         self._newest: datetime | None = None
         self._last_ns = self._last_heading_ns = -1
+        self._earlier_ns: list[int] = []  # times of fixes that came one after another, before the newest one
         self._epoch_ns = -1  # of the newest GGA or RMC
         self._stated: tuple[int, tuple[float, float, float]] | None = None  # sigmas, of a GST
         self._quality = self._stated_quality = 0  # of the newest GGA, and of the one a GST is about
@@ -179,9 +181,10 @@ class NmeaParser:
         if utc_ns is None:
             self._problem("no date yet", "GGA before the first RMC or ZDA; or give date")
             return []
-        if utc_ns <= self._last_ns:
+        if utc_ns <= self._last_ns and not self._goes_on_earlier(utc_ns):
             self._problem("time does not go on", f"GGA of {s.time} does not come after the one before")
             return []
+        self._earlier_ns.clear()
         self._last_ns = self._epoch_ns = utc_ns
         place = _number(s.lat), _number(s.lon), _number(s.alt) + _number(s.sep)
         check_place(*place)
@@ -196,7 +199,7 @@ class NmeaParser:
     def _hdt(self, s: Any) -> list[Message]:
         heading_deg = _number(s.headingT)
         settings = self._settings
-        if not settings.heading_sigma_deg or self._epoch_ns <= self._last_heading_ns:
+        if not settings.heading_sigma_deg or self._epoch_ns == self._last_heading_ns:
             return []
         self._last_heading_ns = self._epoch_ns
         sigma = np.radians([settings.level_sigma_deg, settings.level_sigma_deg, settings.heading_sigma_deg])
@@ -218,6 +221,14 @@ class NmeaParser:
         whole = near.replace(microsecond=0)
         utc_ns = round(whole.timestamp()) * SECOND_NS + near.microsecond * 1000
         return self._settings.clock.utc(utc_ns)
+
+    def _goes_on_earlier(self, utc_ns: int) -> bool:
+        """Whether so many fixes in a row go on from an earlier time that the newest one was wrong, or the clock was set
+        back."""
+        if self._earlier_ns and utc_ns <= self._earlier_ns[-1]:
+            self._earlier_ns.clear()
+        self._earlier_ns.append(utc_ns)
+        return len(self._earlier_ns) >= REBASE_AFTER
 
     def _sigma(self, utc_ns: int, quality: int, hdop: Any) -> tuple[float, float, float]:
         """East, north, up, m."""

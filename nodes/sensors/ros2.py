@@ -120,8 +120,8 @@ class LiveStrips:
     The stamp of an image is the time of its first row. Line 0 is the earliest row of a strip, whichever CCD line it is
     of: what comes first is held back until all topics have begun, or one is `BEGIN_S` ahead. Rows of a topic count on
     from image to image, over images that are lost as well. A topic that begins later, or begins anew, takes its number
-    from the others. When no topic has brought an image for `STRIP_SILENT_S` the next one begins another strip, named
-    by the time of its first line.
+    from the others. When no topic has brought an image for `STRIP_SILENT_S`, or the clock was set back, the next one
+    begins another strip, named by the time of its first line.
 
     Where the camera keeps another rate than the nominal one, its lines get times of their own, by a straight line
     through the newest stamps; the next strip begins with the rate found.
@@ -154,12 +154,13 @@ class LiveStrips:
 
         Parameters
         ----------
-        time_ns : stamp on the clock of ROS, later than that of the CCD line's image before
+        time_ns : stamp on the clock of ROS, later than that of the CCD line's image before, unless that was set back
         pixels : rows (n, samples)
         """
         begin_ns = round(BEGIN_S * SECOND_NS)
         silent = not self._next or time_ns - max(self._next.values())[0] > STRIP_SILENT_S * SECOND_NS
-        if not (silent or (self._held and time_ns > self._held[0].time_ns - begin_ns)):
+        set_back = ccd in self._next and self._next[ccd][0] - time_ns > begin_ns
+        if not (silent or set_back or (self._held and time_ns > self._held[0].time_ns - begin_ns)):
             return self._numbered(_Image(ccd, time_ns, pixels))
         self._held.append(_Image(ccd, time_ns, pixels))
         all_here = {image.ccd for image in self._held} >= self._settings.images.keys()
@@ -320,7 +321,9 @@ class Ros2(Sensor):
             yield (
                 topic,
                 IMAGE,
-                lambda come, left_out, ccd=ccd: (_Image(ccd, *found) for found in image_rows(come, left_out)),
+                lambda come, left_out, ccd=ccd: (
+                    _Image(ccd, *found) for found in image_rows(come, left_out, live=True)
+                ),
             )
 
     def _on_our_clock(self, message: Message) -> Message | None:

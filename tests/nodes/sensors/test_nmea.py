@@ -169,6 +169,26 @@ def test_what_cannot_be_used_is_counted_and_the_next_fix_comes(tmp_path, data, k
     assert messages[-1].stamp_ns == T0 + 1_000_000_000
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        gga("102751.00"),  # an hour ahead
+        sentence("GNRMC,092751.00,V,,,,,,,010140,,,N") + gga("092751.00") + RMC,  # before the receiver has a date
+        sentence("GNZDA,092751.00,22,11,2027,00,00") + gga("092751.00") + RMC,
+    ],
+)
+def test_one_wrong_time_does_not_silence_all_fixes_that_follow(tmp_path, wrong):
+    """They were refused until the wrong time had come: an hour, a year."""
+    hdt = sentence("GNHDT,90.0,T")
+    times = [f"09275{2 + i // 5}.{2 * (i % 5)}0" for i in range(20)]
+    data = RMC + gga("092750.00") + hdt + wrong + hdt + b"".join(gga(time) + hdt for time in times)
+    messages, counts = parse(tmp_path, data, heading_sigma_deg=0.2)
+    assert counts == {"time does not go on": 4}
+    for topic in ("sensor/gnss", "sensor/attitude"):
+        stamps = [message.stamp_ns for message in messages if message.topic == topic]
+        assert stamps[-16:] == [T0 + 2_800_000_000 + i * 200_000_000 for i in range(16)]
+
+
 def test_without_a_date_there_is_no_time(tmp_path):
     messages, counts = parse(tmp_path, gga("092750.20") + RMC + gga("092750.40"))
     assert len(messages) == 1 and counts == {"no date yet": 1}

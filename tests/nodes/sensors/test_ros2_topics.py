@@ -16,7 +16,8 @@ from rosbags.typesys import Stores, get_typestore
 from triline.nodes.convert import time_ns
 from triline.nodes.errors import UserError
 from triline.nodes.formats.keys import Keys
-from triline.nodes.formats.ros2_images import image_rows
+from triline.nodes.formats.ros2 import fix_messages, inertial_messages
+from triline.nodes.formats.ros2_images import image_rows, strip_name
 from triline.nodes.matcher.found_strips import FoundStrips
 from triline.nodes.sensors.ros2 import LiveStrips, Ros2, Ros2Settings, key_expression
 from triline.solver.matching.line_times import LineTimes
@@ -165,6 +166,39 @@ def test_topics_of_one_camera_have_one_strip_and_one_count_of_lines_though_they_
     for message in out:
         off = (message.body.time_ns - (t - 30_000_000)) / 10_000_000 - message.body.first_line
         assert abs(off) <= 0.5
+
+
+@pytest.mark.parametrize("live", [True, False])
+def test_one_stamp_far_ahead_does_not_silence_a_topic(live):
+    """All that followed was left out, for an hour."""
+    times = [T + i * STEP + (3600 * 10**9 if i == 5 else 0) for i in range(20)]
+    left_out = Counter() if live else None
+    found = list(fix_messages(map(fix, times), "/fix", notes := [], "", left_out))
+    assert [m.stamp_ns for m in found] == [t for i, t in enumerate(times) if i != 5]
+    told = "/fix: messages left out: 1 not later than the one before"
+    assert left_out == {"not later than the one before": 1} if live else told in notes
+
+
+def test_a_clock_of_ros_that_is_set_back_in_flight_is_followed():
+    """All was left out until the clock had come to where it was before."""
+    back = [T + i * STEP - (20 * 10**9 if i >= 50 else 0) for i in range(100)]
+    left_out = Counter()
+    found = list(inertial_messages(map(imu, back), "/imu", [], "", left_out, at_once=1))
+    of_attitude = [m.stamp_ns for m in found if m.topic == "sensor/attitude"]
+    assert of_attitude == back[:50] + back[54:]
+    samples = [m.body for m in found if m.topic == "sensor/imu"]
+    assert [b.time_ns for b in samples] == back[:50] + back[55:]  # of the first one nobody knows the interval
+    assert left_out["not later than the one before"] == 4
+
+    given = settings(images=CAMERA, line_rate_hz=100.0)
+    come = {ccd: list(image_rows(map(image, back), Counter(), live=True)) for ccd in CAMERA}
+    strips = LiveStrips(given, {topic: Counter() for topic in CAMERA.values()})
+    blocks = [m.body for i in range(96) for ccd in CAMERA for m in strips.add(ccd, *come[ccd][i])]
+    assert {b.strip for b in blocks} == {"092750", strip_name(back[54])}
+    for strip, times in (("092750", back[:50]), (strip_name(back[54]), back[54:])):
+        for ccd in CAMERA:
+            of = [b for b in blocks if (b.strip, b.ccd) == (strip, ccd)]
+            assert [(b.first_line, b.time_ns) for b in of] == [(4 * i, t) for i, t in enumerate(times)]
 
 
 def test_a_camera_that_keeps_another_rate_than_the_nominal_one():
