@@ -37,6 +37,8 @@ from .authority import (
 
 #: How long the other end is given to answer, s.
 PROBE_S = 2.0
+#: A certificate that expires within so many days is told.
+SOON_DAYS = 30
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ class Bundle:
     authority : name of who certified it
     port : on which the platform meets
     revoked : serial (hexadecimal) -> name of certificates that no longer count
+    until : when the certificate, or that of the authority, expires
     """
 
     folder: Path
@@ -58,6 +61,23 @@ class Bundle:
     authority: str
     revoked: dict[str, str]
     port: int
+    until: datetime.datetime
+
+    @property
+    def expired(self) -> bool:
+        """Whether it has expired since it was checked; all links were closed then."""
+        return datetime.datetime.now(datetime.UTC) > self.until
+
+    def ends_soon(self, now: datetime.datetime | None = None) -> str:
+        """A line where the certificate expires within `SOON_DAYS`, or has; "" where not."""
+        left = self.until - (now or datetime.datetime.now(datetime.UTC))
+        if left > datetime.timedelta(days=SOON_DAYS):
+            return ""
+        expires = "expires" if left > datetime.timedelta() else "expired"
+        return (
+            f"the certificate of {self.name!r} {expires} on {self.until:%Y-%m-%d %H:%M} UTC: "
+            "from then on no program hears another, and nothing is recorded"
+        )
 
     @property
     def configuration(self) -> Path:
@@ -178,9 +198,9 @@ def load_bundle(folder: Path, now: datetime.datetime | None = None) -> Bundle:
         certificate = x509.load_pem_x509_certificate((folder / CERTIFICATE).read_bytes())
         authority = x509.load_pem_x509_certificate((folder / AUTHORITY).read_bytes())
         key = serialization.load_pem_private_key((folder / KEY).read_bytes(), None)
-        bundle = Bundle(
-            folder, facts["name"], facts["kind"], facts["authority"], dict(facts["revoked_serials"]), int(facts["port"])
-        )
+        until = min(certificate.not_valid_after_utc, authority.not_valid_after_utc)
+        revoked, port = dict(facts["revoked_serials"]), int(facts["port"])
+        bundle = Bundle(folder, facts["name"], facts["kind"], facts["authority"], revoked, port, until)
         common = str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
         wanted = str(facts.get("common") or bundle.name)
         uses = set(certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value)

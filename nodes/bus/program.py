@@ -60,6 +60,8 @@ class ProgramOptions:
         bus = Bus(self.platform, source=self.name, port=self.port, file=self.bus_file, secure=self.secure)
         if alone := bus.why_alone():
             self.report(alone)
+        if self.secure is not None and (ends := self.secure.ends_soon()):
+            self.report(f"{self.name}: {ends}")
         if niceness < 0:
             self.report(f"{self.name} goes before other programs (niceness {niceness})")
         return bus

@@ -120,6 +120,8 @@ class LiveFlight:
         with NodeGroup(logs, self.platform, port, bus_file, self.args.secure) as group, _interruptible(self.stop):
             where = f"127.0.0.1:{port}" if bus_file is None else str(bus_file)
             self.say(f"bus on {where}; logs in {group.log_folder}; Ctrl-C ends the flight")
+            if self.secure is not None and (ends := self.secure.ends_soon()):
+                self.say(f"note: {ends}")
             group.start("recorder", "-o", str(self.recording))
             for name in self.estimators:
                 group.start(name, *self.node_arguments(name))
@@ -188,8 +190,13 @@ class LiveFlight:
 
     def _watch(self, group: NodeGroup, bus: Bus, show: Callable[[], None]) -> None:
         """Wait until the flight has ended; a node that dies is started again."""
+        expired = False
         while not self.over(group) and not self.stop.wait(0.25):
             self.tend(bus)
+            if not expired and self.secure is not None and self.secure.expired:
+                expired = True
+                if self.watch is not None:
+                    self.watch.tell(self.secure.ends_soon())
             show()
             for dead in group.dead():
                 if dead.name in self.sensor_ids():

@@ -6,6 +6,7 @@ import contextlib
 import datetime
 import json
 import os
+import re
 import shutil
 import socket
 import ssl
@@ -99,6 +100,14 @@ def test_a_bundle_that_cannot_be_used_is_refused_with_its_reason(authority, tmp_
         load_bundle(good, years)
     with pytest.raises(UserError, match="is the clock of this machine right"):
         load_bundle(good, datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC))
+
+    weeks = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=705)
+    assert load_bundle(good).ends_soon() == ""
+    assert re.fullmatch(
+        r"the certificate of 'ann' expires on 20\d\d-\d\d-\d\d \d\d:\d\d UTC: from then on no program hears .*",
+        load_bundle(good).ends_soon(weeks),
+    )
+    assert "'ann' expired on 20" in load_bundle(good).ends_soon(years) and not load_bundle(good).expired
 
     def spoilt(name: str, spoil) -> Path:
         folder = tmp_path / name
