@@ -45,6 +45,8 @@ JUMP_NS, JUMP_LINES = SECOND_NS, 5
 #: The end of a strip, known when nothing more has come, is stamped so long after the newest platform time, ns, that no
 #: node is past it when it comes.
 END_AHEAD_NS = SECOND_NS // 2
+#: Lines that come so long after those before them are of another strip, ns, also where both are read at once.
+PAUSE_NS = round(STRIP_SILENT_S * SECOND_NS)
 
 
 @dataclass(frozen=True)
@@ -274,11 +276,11 @@ class GrowingTimes:
             self._take(row)
 
     def of(self, first: int, most: int) -> list[int]:
-        """Times of the lines from one on that have times, ns, or `NO_TIME` of those that have none."""
+        """Times of the lines from one on that have times, ns, or `NO_TIME` of those that have none; up to a pause."""
         times = np.array(self.time_ns[first : first + most], dtype=np.int64)
         known = times != NO_TIME
-        other = np.flatnonzero(known != known[:1])
-        return times[: other[0] if len(other) else None].tolist()
+        other = (known[1:] != known[:-1]) | (np.diff(times) > PAUSE_NS)
+        return times[: np.argmax(other) + 1 if other.any() else None].tolist()
 
     def _cells(self, text: str) -> list[tuple[int, str, str]]:
         """Line, where it stands and how its time is written; none in the header, and of a row that is not used."""
@@ -483,7 +485,9 @@ class LineFiles(Sensor):
         """The block, after the announcement of a strip that begins with it."""
         clock, rate_hz = self._settings.clock, self._settings.rate_hz
         self._heard_s = time.monotonic()
-        before = [] if strip in self._strips else self._take_strips()
+        newest_ns = self._strips[strip].newest_ns if strip in self._strips else None
+        goes_on = newest_ns is not None and clock.stamp(clock.utc(time_ns)) - newest_ns <= PAUSE_NS
+        before = [] if goes_on else self._take_strips()
         part = self._strips.get(strip) or self._begun(strip, first)
         missing = part.base - first  # of a CCD line that was behind the others when the strip ended
         if missing > 0:

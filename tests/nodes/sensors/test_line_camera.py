@@ -326,13 +326,23 @@ def test_lines_without_a_time_are_left_out_and_the_camera_goes_on(tmp_path, colu
     assert wanted in sensor.last_problem
 
 
-def test_lines_that_pause_go_on(tmp_path):
-    """A camera that stood still is not a clock that jumps: its times go on from there."""
-    (tmp_path / "n.raw").write_bytes(IMAGE[:, 0].tobytes())
+def test_lines_after_a_pause_are_another_strip_also_where_all_is_read_at_once(tmp_path):
+    """A program that was started again read on in the strip that had ended: no tie points, no orientation."""
+    for ccd, band in (("F", 0), ("N", 1)):
+        (tmp_path / f"{ccd}.raw").write_bytes(IMAGE[:, band].tobytes())
     times = T + np.arange(40) * 10_000_000 + (np.arange(40) > 11) * 90_000_000_000
     text = "line,time_s\n" + "".join(f"{i},{t // 10**9}.{t % 10**9:09d}\n" for i, t in enumerate(times))
     (tmp_path / "times.csv").write_text(text)
-    sensor = LineFiles(settings(tmp_path, images={"N": "n.raw"}, line_times="times.csv"))
-    blocks = [m for m in read(sensor, 5) if m.topic == "sensor/lines/N"]
-    np.testing.assert_array_equal(np.concatenate([m.body.times_ns() for m in blocks]), times)
-    assert not sensor.counters
+    sensor = LineFiles(settings(tmp_path, images={"F": "F.raw", "N": "N.raw"}, line_times="times.csv"))
+    messages = read(sensor, 13)
+    strips = [m.body for m in messages if m.topic == "configuration/strip"]
+    assert [(s.id, s.ended, s.lines) for s in strips] == [
+        ("S7", False, 0), ("S7", True, 12), ("S7-2", False, 0), ("S7-2", True, 28)
+    ]  # fmt: skip
+    for ccd, band in (("F", 0), ("N", 1)):
+        for strip, lines in (("S7", np.arange(12)), ("S7-2", np.arange(12, 40))):
+            of = [m.body for m in messages if m.topic == f"sensor/lines/{ccd}" and m.body.strip == strip]
+            np.testing.assert_array_equal(np.concatenate([b.times_ns() for b in of]), times[lines])
+            np.testing.assert_array_equal(np.concatenate([b.pixels for b in of]), IMAGE[lines, band])
+            assert of[0].first_line == 0
+    assert dict(sensor.counters) == {"strip goes on": 1}
