@@ -24,6 +24,8 @@ _SECOND_NS = 1_000_000_000
 SILENT_S = 0.5
 #: ... and for so many of its messages.
 SILENT_PERIODS = 2.0
+#: Why messages are not used of which no operator is told.
+AGAIN = "their program was started again, and the run before it may have gone on"
 #: What was refused is said again after so long at the earliest, and is an alarm until so long after the last, s.
 AGAIN_S, ALARM_S = 10.0, 30.0
 
@@ -38,6 +40,8 @@ class _Voice:
     latest_ns : newest stamp
     body : what it said, where that counts
     rival, rival_ns : a later run with earlier stamps that has spoken since this one did, and the first of these stamps
+    later : newest of the later runs whose messages were not used
+    beside : whether this run has spoken on after a later one had begun: then they are two programs
     """
 
     source: str
@@ -46,6 +50,8 @@ class _Voice:
     body: Any = None
     rival: int = 0
     rival_ns: int = 0
+    later: int = 0
+    beside: bool = False
 
 
 @dataclass(slots=True)
@@ -132,12 +138,17 @@ class Voices:
         if message.source != voice.source:
             return self._refuse(key, message, f"{message.topic} belongs to {voice.source!r}")
         if message.start != voice.start and not self._takes_over(message, voice, keeps):
+            if message.start > voice.start and not voice.beside:  # as well this program, started again a moment ago
+                voice.later = message.start
+                self._count(message.topic)
+                return Heard()
             return self._refuse(key, message, f"two programs speak as {voice.source!r}")
         if message.topic in FIXED and self._flying:
             return self._hold_change(key, message)
         if message.start != voice.start:
             self._held.pop((message.topic, message.source), None)
         same = message.start == voice.start
+        voice.beside, voice.later = same and (voice.beside or voice.later > 0), 0
         voice.latest_ns = max(voice.latest_ns, message.stamp_ns) if same else message.stamp_ns
         voice.start, voice.rival = message.start, 0
         if keeps:
@@ -183,7 +194,7 @@ class Voices:
         return self._note((message.topic, message.source), message, text, stays=True, again=again)
 
     def _note(self, key: tuple[str, str], message: Message, text: str, *, stays: bool, again: bool = False) -> Heard:
-        self.refused[message.topic] = self.refused.get(message.topic, 0) + 1
+        self._count(message.topic)
         voices = (voice.latest_ns for (topic, _), voice in self._voices.items() if topic == message.topic)
         now, held = max(message.stamp_ns, *voices, 0), self._held.get(key)
         if held is None:
@@ -198,6 +209,9 @@ class Voices:
             return Heard()
         held.told_ns = now
         return Heard(alarms=(f"{text} ({held.count} messages)",))
+
+    def _count(self, topic: str) -> None:
+        self.refused[topic] = self.refused.get(topic, 0) + 1
 
     # ---- the operator's word
 
@@ -246,7 +260,7 @@ class RecordedVoices:
             return (message,)
         heard = self._voices.hear(message)
         if not heard.pass_on and message.topic != VERDICT:
-            n, text = self.left_out.get(message.topic, (0, ""))
+            n, text = self.left_out.get(message.topic, (0, AGAIN))
             self.left_out[message.topic] = n + 1, (heard.alarms or (text,))[-1]
         elif message.topic == VERDICT:  # what it lets in was left out before
             for topic in {used.topic for used in heard.pass_on} & self.left_out.keys():

@@ -93,8 +93,10 @@ def test_a_program_that_was_started_again_takes_over_and_one_beside_it_does_not(
     rig = Rig()
     for i in range(10):
         rig.hear("sensor/gnss", 0.2 * i, start=1)
-    assert "two programs speak as 'a'" in rig.hear("sensor/gnss", 1.9, start=2)[0]
-    for i in range(10, 20):
+    assert rig.hear("sensor/gnss", 1.9, start=2) == []  # the first may have ended
+    rig.hear("sensor/gnss", 2.0, start=1)
+    assert "two programs speak as 'a'" in rig.hear("sensor/gnss", 2.1, start=2)[0]
+    for i in range(11, 20):
         rig.hear("sensor/gnss", 0.2 * i, start=1)
     assert rig.count("sensor/gnss") == 20
     for i in range(10):  # the first is silent since 3.8 s
@@ -102,6 +104,16 @@ def test_a_program_that_was_started_again_takes_over_and_one_beside_it_does_not(
     assert rig.count("sensor/gnss") == 30
     rig.hear("sensor/gnss", 7.0, start=1)  # the first one again
     assert rig.count("sensor/gnss") == 30
+
+
+def test_a_program_that_was_started_again_and_says_all_once_more_is_no_second_one():
+    """Its operator was told to stop one of them: there is but one."""
+    rig = Rig()
+    for i in range(100):
+        rig.hear("sensor/lines/N", 0.1 * i, start=1)
+    told = [text for i in range(120) for text in rig.hear("sensor/lines/N", 0.1 * i, start=2)]
+    assert told == [] and rig.node.alarm == ""
+    assert [given.start for given in rig.node.given].count(2) > 110
 
 
 def test_the_same_flight_played_once_more_beside_itself_is_not_used_and_after_it_is():
