@@ -366,6 +366,7 @@ class LineFiles(Sensor):
 
     def __init__(self, settings: LineCameraSettings) -> None:
         super().__init__(settings.id)
+        self.from_begin = True
         self._settings = settings
         self._period_ns = round(SECOND_NS / settings.rate_hz)
         self._strips: dict[str, _Part] = {}  # of those not ended, by the name that the files give them

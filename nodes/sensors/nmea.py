@@ -290,6 +290,7 @@ class Nmea(Sensor):
 
     def __init__(self, settings: NmeaSettings) -> None:
         super().__init__(settings.id)
+        self.from_begin = settings.address.startswith("file:")
         self._settings = settings
         self.parser = NmeaParser(settings, self.problem)
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from threading import Event
 from typing import TYPE_CHECKING
 
@@ -15,9 +17,12 @@ from ..node import Message, Node
 
 if TYPE_CHECKING:
     from ..bus.program import ProgramOptions
+    from ..bus.session import Bus
 
 #: Keys that each sensor table may have.
 COMMON = ("id", "kind", "clock_offset_s", "delay_s", "imu_noise")
+#: So long a program that may have been started again waits for the recorder, which knows, s.
+RECORDER_S = 2.0
 #: Where a program waits for data it looks this often whether it shall end, s.
 LOOK_S = 0.1
 
@@ -66,6 +71,10 @@ class Sensor(Node):
     Parameters
     ----------
     id : name on the bus
+
+    Attributes
+    ----------
+    from_begin : whether it reads its files from their begin, so that it says all once more when it is started again
     """
 
     inputs = ()
@@ -74,6 +83,7 @@ class Sensor(Node):
         super().__init__()
         self.name = id  # type: ignore[misc]  # several of one class
         self.published = 0
+        self.from_begin = False
         #: White noise of the inertial unit, rad/sqrt(s) and m/s/sqrt(s), for samples that do not state theirs.
         self.noise: tuple[float, float] | None = None
 
@@ -83,7 +93,7 @@ class Sensor(Node):
 
     def state(self) -> str:
         """How much has come and was refused; the counters tell why."""
-        refused = sum(self.counters.values())
+        refused = sum(self.counters.values()) - self.counters["said before"]
         return f"{self.published} messages" + (f", {refused} refused" if refused else "")
 
 
@@ -103,7 +113,10 @@ def refuse_unknown(keys: Keys, known: tuple[str, ...]) -> None:
 
 
 def publish(options: ProgramOptions, sensor: Sensor) -> int:
-    """Publish what a sensor measures until told to stop; each kind of problem is told when it comes first."""
+    """Publish what a sensor measures until told to stop; each kind of problem is told when it comes first.
+
+    What the recorder has heard of the run before this one is not said again.
+    """
     told: set[str] = set()
     options = replace(options, name=sensor.name)
     stamp_ns = 0
@@ -112,8 +125,14 @@ def publish(options: ProgramOptions, sensor: Sensor) -> int:
         bus.announce(sensor.name)
         status = StatusPublisher(bus, sensor.name)
         status.publish("starting", {}, sensor, 0.0, 0, 0)
+        said_ns = _said_ns(bus, options.stop, sensor.name) if sensor.from_begin else 0
         for message in sensor.messages(options.stop):
-            if message is not None:
+            if message is not None and message.stamp_ns <= said_ns:
+                if not sensor.counters["said before"]:
+                    until = datetime.fromtimestamp(said_ns // SECOND_NS, UTC)
+                    sensor.last_problem = f"what was published up to {until:%H:%M:%S} UTC is not said again"
+                sensor.counters["said before"] += 1
+            elif message is not None:
                 if message.topic == "sensor/imu":
                     state_noise(message.body, sensor.noise)
                 bus.publish(message)
@@ -129,3 +148,11 @@ def publish(options: ProgramOptions, sensor: Sensor) -> int:
     kinds = "".join(f", {n} {kind}" for kind, n in sorted(sensor.counters.items()))
     options.report(f"{sensor.name} stopped: {sensor.published} messages{kinds}")
     return 0
+
+
+def _said_ns(bus: Bus, stop: Event, name: str) -> int:
+    """How far the recorder has heard a program of this name; 0 where it has not, or there is none."""
+    until_s = time.monotonic() + RECORDER_S
+    while "recorder" not in bus.alive() and time.monotonic() < until_s and not stop.wait(LOOK_S):
+        pass
+    return max((body.time_ns for body in bus.query("heard", "observation/progress", source=name)), default=0)

@@ -235,6 +235,7 @@ class Stream(Sensor):
 
     def __init__(self, settings: StreamSettings) -> None:
         super().__init__(settings.id)
+        self.from_begin = settings.address.startswith("file:")
         self._settings = settings
 
     def messages(self, stop: Event) -> Iterator[Message | None]:

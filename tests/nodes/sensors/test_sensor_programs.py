@@ -19,6 +19,7 @@ from triline.nodes.cli.node import _value
 from triline.nodes.convert import gnss_message
 from triline.nodes.formats.flight_folder import live_configuration, read_flight
 from triline.nodes.monitor.sensor_watch import SensorWatch
+from triline.nodes.sensors import line_camera
 from triline.nodes.sensors.settings import read_sensors
 from triline.nodes.sensors.stream import run
 from triline.schemas import messages as m
@@ -223,6 +224,32 @@ def test_a_program_publishes_under_its_id_and_tells_what_it_refuses(tmp_path):
     assert statuses[-1].state == "5 messages, 2 refused"
     assert [(c.name, c.value) for c in statuses[-1].counters] == [("not a record", 2)]
     assert len([line for line in said if "not a record: rubbish, wanted GNSS, IMU" in line]) == 1
+
+
+def test_a_program_that_was_started_again_does_not_say_its_file_once_more(tmp_path):
+    """All lines of the flight were recorded twice, and `process` lost half of the tie points."""
+    port, said, received = free_port(), [], []
+    (tmp_path / "n.raw").write_bytes(bytes(4000))
+    table = {"id": "cam", "images": {"N": str(tmp_path / "n.raw")}, "samples": 10, "line_rate_hz": 100.0}
+    table["first_time"] = "2026-11-22T09:27:50Z"
+    options = ProgramOptions("lines", "here", port, tables={"lines": table}, report=said.append)
+    begun_ns = 1_795_339_670 * 10**9
+    with Bus("here", source="recorder", port=port) as bus:
+        bus.answer("heard", lambda asked: m.Progress(time_ns=begun_ns + 10**9) if asked["source"] == "cam" else None)
+        bus.announce("recorder")
+        bus.subscribe("sensor/lines/*", received.append)
+        bus.subscribe("configuration/strip", received.append)
+        thread = threading.Thread(target=line_camera.run, args=(options,))
+        thread.start()
+        try:
+            wait_for(lambda: len(received) >= 30, 60, "the lines")
+        finally:
+            options.stop.set()
+            thread.join(60)
+    stamps = [raw.envelope.stamp_ns for raw in received if raw.topic == "sensor/lines/N"]
+    assert stamps == [begun_ns + i * 100_000_000 + 90_000_000 for i in range(10, 40)]
+    assert [decode(raw.topic, raw.data).ended for raw in received if raw.topic == "configuration/strip"] == [True]
+    assert "cam: said before: what was published up to 09:27:51 UTC is not said again" in said
 
 
 def test_first_data():
