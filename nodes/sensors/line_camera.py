@@ -40,7 +40,7 @@ _BLOCK_NAME = re.compile(r"(?:(?P<strip>[^_]+)_)?(?P<ccd>[^_]+)_(?P<first>\d+)_(
 _MOST_LINES = 4096
 #: In place of the time of a line that nobody knows.
 NO_TIME = -1
-#: A time that is later than that of the line before by more, ns, is believed with so many lines in a row.
+#: A first time, or one that is later than that of the line before by more, ns, is believed with so many lines in a row.
 JUMP_NS, JUMP_LINES = SECOND_NS, 5
 #: The end of a strip, known when nothing more has come, is stamped so long after the newest platform time, ns, that no
 #: node is past it when it comes.
@@ -232,8 +232,8 @@ class GrowingImage:
 class GrowingTimes:
     """UTC of lines from a CSV ``line,time`` or ``line,time_s`` that grows with the image.
 
-    A row that cannot be used, or whose time does not go on, leaves its line without a time. Times that jump ahead are
-    believed when `JUMP_LINES` lines in a row have gone on from there.
+    A row that cannot be used, or whose time does not go on, leaves its line without a time. The first times, and times
+    that jump ahead, are believed when `JUMP_LINES` lines in a row have gone on from there.
 
     Parameters
     ----------
@@ -327,12 +327,13 @@ class GrowingTimes:
         if newest_ns is not None and row.time_ns <= newest_ns:
             self._refuse(f"{row.shown} does not come after the line before it")
             return
-        if self._ahead and row.time_ns <= self._ahead[-1].time_ns:
+        if self._ahead and not 0 < row.time_ns - self._ahead[-1].time_ns <= JUMP_NS:
             for ahead in self._ahead:
-                self._refuse(f"{ahead.shown} is ahead of the lines after it")
+                self._refuse(f"{ahead.shown} is not near the lines after it")
             self._ahead.clear()
         self._ahead.append(row)
-        if newest_ns is not None and self._ahead[0].time_ns - newest_ns > JUMP_NS and len(self._ahead) < JUMP_LINES:
+        jumped = newest_ns is None or self._ahead[0].time_ns - newest_ns > JUMP_NS
+        if jumped and len(self._ahead) < JUMP_LINES:
             return
         for known in self._ahead:
             self.time_ns.extend([NO_TIME] * (known.line - len(self.time_ns)))

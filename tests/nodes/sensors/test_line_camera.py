@@ -289,7 +289,9 @@ def test_line_times_that_cannot_be(tmp_path, text, wanted):
     ("column", "rows", "without", "wanted"),
     [
         ("time_s", {8: "8,6.95", 9: "9,6.96"}, (8, 9), "times.csv:11: '6.96' does not come after the line before it"),
-        ("time_s", {8: "8,3600", 9: "9,3601"}, (8, 9), "times.csv:11: '3601' is ahead of the lines after it"),
+        ("time_s", {8: "8,3600", 9: "9,3601"}, (8, 9), "times.csv:11: '3601' is not near the lines after it"),
+        ("time_s", {0: "0,3600", 1: "1,3601"}, (0, 1), "times.csv:3: '3601' is not near the lines after it"),
+        ("time_s", {0: "0,0"}, (0,), "times.csv:2: '0' is not near the lines after it"),
         ("time_s", {0: "0,x"}, (0,), "times.csv:2: 'x', wanted seconds since the Unix epoch"),
         ("time_s", {3: "3,99999999999"}, (3,), "times.csv:5: '99999999999', wanted seconds since the Unix epoch"),
         ("time", {8: "8,noon"}, (8,), "times.csv:10: 'noon', wanted an ISO 8601 time"),
