@@ -32,11 +32,11 @@ def header(path: Path, **keys) -> None:
 
 
 def read(sensor: LineFiles, n: int):
-    """The first messages, and the end of the strip."""
-    stop, out = threading.Event(), []
+    """The first messages, and the end of the strip; less where no more come in a minute."""
+    stop, out, until = threading.Event(), [], time.monotonic() + 60
     for message in sensor.messages(stop):
         out += [] if message is None else [message]
-        if len(out) == n:
+        if len(out) == n or time.monotonic() > until:
             stop.set()
     return out
 
