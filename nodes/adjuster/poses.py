@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...solver.camera.line_camera import LineCamera, finest_pixel
 from ...solver.geometry.trajectory import Trajectory
-from ...solver.models.slow_errors import LEAST_NOISE, SlowErrors
+from ...solver.models.slow_errors import LEARNT_SHARE, LEAST_NOISE, SlowErrors
 from .. import convert
 
 Array = NDArray[np.floating]
@@ -30,8 +30,6 @@ KNOWN_ATTITUDE_RAD = 0.2
 #: A filter that begins needs a fix before its poses are valid. For so long, s, its first poses do not say how good the
 #: trajectory of a strip is. Tuned: a few fixes at 1 Hz; longer only delays strips that have no GNSS at all.
 FIRST_FIX_S = 3.0
-#: If smoothing takes off this share of a variance, the filter learns: its errors are no constants.
-LEARNT_SHARE = 0.02
 #: So many statements about slow errors are remembered.
 MOST_STATED = 200
 #: Refined orientation is kept this long for queries, s.

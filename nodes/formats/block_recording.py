@@ -18,7 +18,7 @@ from ...solver.arrays import Array
 from ...solver.geometry.frames import CrsError
 from ...solver.geometry.trajectory import Trajectory
 from ...solver.models import WANDER_TIMES
-from ...solver.models.slow_errors import SlowErrors
+from ...solver.models.slow_errors import LEARNT_SHARE, SlowErrors
 from ..convert import SECOND_NS, camera_from, iso, largest_step_ns, local_frame, role_of, same_frame, slow_errors_of
 from ..errors import UserError
 from ..node import Message
@@ -30,6 +30,8 @@ TOPICS = (
     *("configuration/project", "configuration/camera", "configuration/strip"),
     *("observation/control", "observation/verdict", "observation/tie", "trajectory/filtered", "trajectory/smoothed"),
 )
+#: Topics of the measured trajectory, the best first.
+POSES = ("trajectory/smoothed", "trajectory/filtered")
 
 #: Differences below this share of a variance are rounding.
 ROUNDING = 1e-9
@@ -74,7 +76,7 @@ class _Collected:
             for image in body.images:
                 if image.time_ns:
                     self.times.setdefault(image.strip, []).append((image.line, image.time_ns))
-        elif message.topic in ("trajectory/filtered", "trajectory/smoothed"):
+        elif message.topic in POSES:
             stamp = body.timestamp.seconds * SECOND_NS + body.timestamp.nanos
             self.poses.setdefault(message.topic, []).append((stamp, body.strip, body))
 
@@ -101,8 +103,10 @@ def block_from_messages(messages: Iterable[Message], name: str) -> BlockData:
     ):
         if not getattr(found, what):
             raise UserError(f"{name}: no message on {topic}; it cannot be adjusted as a block")
-    poses = found.poses.get("trajectory/smoothed") or found.poses.get("trajectory/filtered")
-    if not poses:
+    for of_topic in found.poses.values():
+        of_topic.sort(key=lambda pose: pose[0])
+    poses = next((found.poses[topic] for topic in POSES if found.poses.get(topic)), None)
+    if poses is None:
         raise UserError(
             f"{name}: no message on trajectory/smoothed or trajectory/filtered; run `triline process` first?"
         )
@@ -112,24 +116,23 @@ def block_from_messages(messages: Iterable[Message], name: str) -> BlockData:
         raise UserError(f"{name}: configuration/camera: {error}") from None
     project = found.project or m.Project(name=name)
     notes: list[str] = []
-    poses.sort(key=lambda pose: pose[0])
     # times near the start of the epoch are a project's own; others count from their start, to keep all digits
     reference = 0 if poses[-1][0] < 10**8 * SECOND_NS else poses[0][0] // SECOND_NS * SECOND_NS
     stated = any(getattr(project, key) for key in SIGMAS)
     slow = slow_errors_of(project) if stated else None
-    widened = {} if slow is None else _as_uncertain_as_poses(slow, found, poses)
-    strips = _strips_of(found, poses, reference, notes, {lens.id for lens in camera.lenses}, slow, widened)
+    of_filter, uncertain = ({}, []) if slow is None else _errors_of_filter(slow, found)
+    strips = _strips_of(found, poses, reference, notes, {lens.id for lens in camera.lenses}, slow, of_filter)
     if not strips:
         raise UserError(f"{name}: no strip with a trajectory; {notes[0] if notes else ''}")
     settings: dict[str, object] = {key: tuple(getattr(project, key)) for key in SIGMAS if getattr(project, key)}
     settings |= {key: getattr(project, key) for key in WANDER_TIMES if getattr(project, key)}
-    own = {strip.id: _settings_of(widened[strip.id]) for strip in strips if strip.id in widened}
-    if own:
+    own = {strip.id: _settings_of(of_filter[strip.id]) for strip in strips if strip.id in of_filter}
+    if uncertain := [id for id in own if id in uncertain]:
         notes.append(
-            f"{name}: where strip {', '.join(own)} begins poses are less certain than the project states; so are slow "
-            "errors there, as they are adjusted"
+            f"{name}: where strip {', '.join(uncertain)} begins poses are less certain than the project states; so are "
+            "slow errors there, as they are adjusted"
         )
-    apriori = Apriori(project.image_sigma_px or Apriori.image_sigma_px, settings, of_strip=own, wide=bool(own))
+    apriori = Apriori(project.image_sigma_px or Apriori.image_sigma_px, settings, of_strip=own, wide=bool(uncertain))
     if poses[0][0] < found.camera_ns:
         notes.append(
             f"{name}: before {iso(found.camera_ns)} nodes used another camera; image points of then are adjusted with "
@@ -161,7 +164,7 @@ def _strips_of(
     notes: list[str],
     lenses: set[str],
     slow: SlowErrors | None,
-    widened: Mapping[str, SlowErrors],
+    of_filter: Mapping[str, SlowErrors],
 ) -> tuple[Strip, ...]:
     time_ns = np.array([pose[0] for pose in poses], dtype=np.int64)
     label = np.array([pose[1] for pose in poses], dtype=object)
@@ -194,7 +197,7 @@ def _strips_of(
             [(q.position.x, q.position.y, q.position.z) for q in p],
             [(q.orientation.x, q.orientation.y, q.orientation.z, q.orientation.w) for q in p],
         )
-        noise = _noise_of(bodies, widened.get(id, slow))
+        noise = _noise_of(bodies, of_filter.get(id, slow))
         lens = id.rpartition("/")[2] if "/" in id else None
         strip = Strip(
             id,
@@ -249,33 +252,55 @@ def _notes_of_validity(strip: str, poses: list[Any]) -> list[str]:
     ]
 
 
-def _as_uncertain_as_poses(
-    slow: SlowErrors, found: _Collected, poses: list[tuple[int, str, Any]]
-) -> dict[str, SlowErrors]:
-    """By its name, slow errors of each strip at whose begin the poses are clearly less certain than the project states.
+def _errors_of_filter(slow: SlowErrors, found: _Collected) -> tuple[dict[str, SlowErrors], list[str]]:
+    """By its name, slow errors of each strip whose poses do not err as the project states, and the strips at whose
+    begin they are clearly less certain.
 
     As on line, what a filter does not know at the begin of a strip is an error for long, and no noise of single poses
     (`SlowErrors.widened`); its wander is as fast as there, unless such strips are so long that this would take too many
-    unknowns (`FAST_WANDER_S`): then it is as slow as the project states.
+    unknowns (`FAST_WANDER_S`): then the attitude's is as slow as the project states. Of an inertial filter that learns
+    the positions err faster than stated in all strips (`SlowErrors.with_taken_back`).
     """
-    times, wider = np.array([pose[0] for pose in poses], dtype=np.int64), {}
+    usual, wider = {}, {}
+    times = {topic: np.array([pose[0] for pose in poses], dtype=np.int64) for topic, poses in found.poses.items()}
     for id, body in found.strips.items():
-        covariance = poses[min(int(np.searchsorted(times, body.first_line_time_ns)), len(poses) - 1)][2].covariance
-        if len(covariance) == 36 and np.isfinite(covariance).all():
-            own = slow.widened(np.diag(covariance[::7]))
-            if own is not slow:
-                wider[id] = own
+        smoothed, filtered = (_variance_at(found, times, topic, body.first_line_time_ns) for topic in POSES)
+        at_begin = filtered if smoothed is None else smoothed
+        if at_begin is None:
+            continue
+        learns = smoothed is not None and filtered is not None and _learns(smoothed, filtered)
+        usual[id] = slow.with_taken_back() if learns and any(slow.wander_m) else slow
+        own = slow.widened(np.diag(at_begin))
+        if own is not slow:
+            wider[id] = own
     bodies = [found.strips[id] for id in wider]
     lasts_s = sum(body.lines / body.line_rate_hz if body.line_rate_hz > 0 else 0.0 for body in bodies)
-    if all(body.lines for body in bodies) and lasts_s <= FAST_WANDER_S:
-        return wider
-    return {id: _slowly(own, slow) for id, own in wider.items()}
+    if not all(body.lines for body in bodies) or lasts_s > FAST_WANDER_S:
+        wider = {id: _slowly(own, usual[id], slow) for id, own in wider.items()}
+    return {id: own for id, own in (usual | wider).items() if own is not slow}, list(wider)
 
 
-def _slowly(wider: SlowErrors, stated: SlowErrors) -> SlowErrors:
-    """Widened errors with a wander as slow as stated."""
-    metres = np.sqrt(np.square(stated.wander_m) + np.square(wider.offset_m) - np.square(stated.offset_m)).tolist()
-    times_s = {"wander_time_s": stated.wander_time_s, "attitude_time_s": stated.attitude_time_s}
+def _variance_at(found: _Collected, times: dict[str, NDArray[np.int64]], topic: str, time_ns: int) -> Any:
+    """Variances (6,) of the first pose of a topic from a time on; None where it states none."""
+    poses = found.poses.get(topic)
+    if not poses:
+        return None
+    covariance = poses[min(int(np.searchsorted(times[topic], time_ns)), len(poses) - 1)][2].covariance
+    variance = np.array(covariance).reshape(6, 6).diagonal() if len(covariance) == 36 else np.full(6, np.nan)
+    return variance if np.isfinite(variance).all() else None
+
+
+def _learns(smoothed: NDArray[np.floating], filtered: NDArray[np.floating]) -> bool:
+    """Whether smoothing takes off of the variances of an attitude: a filter that takes over a measured one does not
+    learn it.
+    """
+    return bool((smoothed[3:] < (1.0 - LEARNT_SHARE) * filtered[3:]).any())
+
+
+def _slowly(wider: SlowErrors, usual: SlowErrors, stated: SlowErrors) -> SlowErrors:
+    """Widened errors with a wander as slow as that of the other strips."""
+    metres = np.sqrt(np.square(usual.wander_m) + np.square(wider.offset_m) - np.square(stated.offset_m)).tolist()
+    times_s = {"wander_time_s": usual.wander_time_s, "attitude_time_s": usual.attitude_time_s}
     return replace(wider, wander_m=(metres[0], metres[1], metres[2]), **times_s)
 
 

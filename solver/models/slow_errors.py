@@ -19,6 +19,8 @@ VARIANCE_EXCEEDS = 1.5
 MUCH_LESS = 4.0
 #: Of what a pose is more uncertain by, this share of the standard deviation may wander.
 WANDERING_SHARE = 1.0
+#: If smoothing takes off this share of a variance, the filter learns: its errors are no constants.
+LEARNT_SHARE = 0.02
 #: Correlation time of the errors of a trajectory whose filter still learns, s: about the lag of its smoother, which
 #: says something else with every second of data that it has more. Judged over seeds by bench/apriori.py. Its bound:
 #: where a turn right after a strip shows the heading at once, the last seconds of smoothed poses change by more than

@@ -341,10 +341,24 @@ def less_certain(messages, strip, sigma_kappa):
         yield message
 
 
+def with_filtered(messages, factor):
+    """The messages of a block with filtered poses, too, whose attitude has variances so many times as large."""
+    for message in messages:
+        yield message
+        if message.topic == "trajectory/smoothed":
+            body = type(message.body)()
+            body.CopyFrom(message.body)
+            for axis in (21, 28, 35):
+                body.covariance[axis] *= factor
+            yield replace(message, topic="trajectory/filtered", body=body)
+
+
 def test_strips_that_begin_before_a_filter_has_found_its_attitude_are_stated_apart(tmp_path):
     """One sigma for all: sigma0 was 0.8 and points twice as far off in flights whose first strip alone began so."""
     write_block(tmp_path, simulated_block("local"))
     read = read_block(tmp_path)
+    wander = {"wander_sigma_m": (0.3, 0.3, 0.5), "wander_sigma_deg": (0.005, 0.005, 0.01), "wander_time_s": 30.0}
+    read = replace(read, apriori=replace(read.apriori, trajectory={**read.apriori.trajectory, **wander}))
     first, *others = (strip.id for strip in read.strips)
     assert others
     block = block_from_messages(less_certain(block_messages(read), first, 0.02), "flight")
@@ -356,6 +370,12 @@ def test_strips_that_begin_before_a_filter_has_found_its_attitude_are_stated_apa
     own = slow_errors_of_strip(model, first)
     assert own.shift[2] == pytest.approx(0.02, rel=0.01) and own.shift[:2] == pytest.approx(usual.slow.shift[:2])
     assert {strip.id: strip.noise is None for strip in block.strips} == dict.fromkeys((first, *others), True)
+    # of a filter that learns its attitude positions err faster than stated, in all strips
+    learnt = models_of(block_from_messages(with_filtered(block_messages(read), 1.1), "flight"), "wander", None, {})[0]
+    assert all(slow_errors_of_strip(learnt, id) == usual.slow.with_taken_back() for id in (first, *others))
+    assert usual.slow.with_taken_back().wander_time_s < 0.8 * usual.slow.wander_time_s
+    taken_over = block_from_messages(with_filtered(block_messages(read), 1.0), "flight")
+    assert models_of(taken_over, "wander", None, {})[0] == usual
     # a second flight with strips of the same names, which get others: each has its own still
     flights = [block, replace(block, apriori=replace(block.apriori, of_strip={}, wide=False))]
     joined = join_blocks(flights[::-1], ["day1", "day2"])
