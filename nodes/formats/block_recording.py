@@ -254,7 +254,7 @@ def _notes_of_validity(strip: str, poses: list[Any]) -> list[str]:
 
 def _errors_of_filter(slow: SlowErrors, found: _Collected) -> tuple[dict[str, SlowErrors], list[str]]:
     """By its name, slow errors of each strip whose poses do not err as the project states, and the strips at whose
-    begin they are clearly less certain.
+    begin they are clearly less certain than that.
 
     As on line, what a filter does not know at the begin of a strip is an error for long, and no noise of single poses
     (`SlowErrors.widened`); its wander is as fast as there, unless such strips are so long that this would take too many
@@ -280,7 +280,9 @@ def _errors_of_filter(slow: SlowErrors, found: _Collected) -> tuple[dict[str, Sl
     return {id: own for id, own in (usual | wider).items() if own is not slow}, list(wider)
 
 
-def _variance_at(found: _Collected, times: dict[str, NDArray[np.int64]], topic: str, time_ns: int) -> Any:
+def _variance_at(
+    found: _Collected, times: dict[str, NDArray[np.int64]], topic: str, time_ns: int
+) -> NDArray[np.floating] | None:
     """Variances (6,) of the first pose of a topic from a time on; None where it states none."""
     poses = found.poses.get(topic)
     if not poses:
@@ -291,8 +293,8 @@ def _variance_at(found: _Collected, times: dict[str, NDArray[np.int64]], topic: 
 
 
 def _learns(smoothed: NDArray[np.floating], filtered: NDArray[np.floating]) -> bool:
-    """Whether smoothing takes off of the variances of an attitude: a filter that takes over a measured one does not
-    learn it.
+    """Whether smoothing makes the variances (6,) of an attitude smaller. They stay as they are where the filter takes
+    over a measured attitude.
     """
     return bool((smoothed[3:] < (1.0 - LEARNT_SHARE) * filtered[3:]).any())
 

@@ -291,13 +291,16 @@ class PartitionedEquations:
         self.changes = self.changes._replace(**what)
 
     def solution(
-        self, outcome: Outcome, history: tuple[Iteration, ...], n_rays: int, n_control: int
+        self, outcome: Outcome, history: tuple[Iteration, ...], n_rays: int, n_control: int, wide: bool = False
     ) -> PartitionedSolution:
-        """The solution at the values reached, with the numbers of rays and control coordinates that take part."""
+        """The solution at the values reached, with the numbers of rays and control coordinates that take part.
+
+        ``wide`` : see `Problem`
+        """
         block = self.block
         n = 2 * n_rays + self.prior.n_observations + n_control
         u = block.n_unknowns - len(outcome.factor.undetermined) + self.rank
-        assumed = assumed_of(block.unknowns, self.prior, self.theta, outcome.factor)
+        assumed = assumed_of(block.unknowns, self.prior, self.theta, outcome.factor, wide)
         return PartitionedSolution(
             block, self.theta, outcome.factor, self.cost, n, u, outcome.steps, outcome.converged, history, assumed,
             Kept(block, self.version),

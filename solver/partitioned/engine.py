@@ -125,7 +125,8 @@ class Engine:
         found = list(self.runner.each(tasks.points, block.keys, lambda key: (version,)))
         weight = np.concatenate([f.weight for f in found])
         history = tuple(descent.history)
-        solved = equations.solution(outcome, history, int((weight > 0).sum()), problem.control.n_observations)
+        n_rays, n_control = int((weight > 0).sum()), problem.control.n_observations
+        solved = equations.solution(outcome, history, n_rays, n_control, problem.wide)
         rank = np.concatenate([f.rank for f in found])
         nothing = np.empty((0, 0))
         return SolutionInParts(

@@ -335,6 +335,9 @@ def test_what_an_inertial_filter_does_not_know_is_no_noise_of_single_poses(tmp_p
     assert (rmse < [0.2, 0.3, 0.7]).all() and (rmse < 2.0 * sigma).all() and (sigma < 0.5).all()
     # sigmas that hold until a filter has found its attitude are no observations: residuals would be next to nothing
     assert np.sqrt(np.mean((rmse / sigma) ** 2)) < 1.3 and result["redundancy"] < result["n_image_points"]
+    assert adjust(oriented, "-q", "--workers", "1", "-o", tmp_path / "parts") == 0
+    parts = result_in(tmp_path / "parts")
+    assert parts["redundancy"] == result["redundancy"] and parts["sigma0"] == pytest.approx(result["sigma0"], rel=1e-6)
 
 
 @pytest.mark.parametrize("noise", ["t3", "normal"])

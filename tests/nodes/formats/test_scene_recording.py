@@ -211,17 +211,22 @@ def pictures(tmp_path_factory):
     return folder
 
 
+def matched_points(made, out):
+    """Number of points that are matched and adjusted in a recording of scenes; the result goes beside it."""
+    settings, points = out.with_name("dgr.toml"), out.with_name("points.csv")
+    settings.write_text('[adjuster]\nmodel = "dgr"\n')
+    nodes = ["--nodes", "matcher,adjuster", "--config", str(settings)]
+    assert main(["process", "-q", str(made), *nodes, "-o", str(out)]) == 0
+    assert main(["export", str(out), "--points", str(points)]) == 0
+    return sum("-M" in row.split(",")[0] for row in points.read_text().splitlines())
+
+
 def test_pictures_of_scenes(pictures, tmp_path, capsys):
     """A user's scenes with their images: imported, matched between the lenses, adjusted, rectified."""
     made, out = tmp_path / "pair.mcap", tmp_path / "out.mcap"
     lines = f"scene/F={pictures / 'F.tif'},scene/B={pictures / 'B.tif'}"
     assert main(["import", str(pictures / "pair"), "--lines", lines, "-o", str(made)]) == 0
-    (tmp_path / "dgr.toml").write_text('[adjuster]\nmodel = "dgr"\n')
-    nodes = ["--nodes", "matcher,adjuster", "--config", str(tmp_path / "dgr.toml")]
-    assert main(["process", "-q", str(made), *nodes, "-o", str(out)]) == 0
-    assert main(["export", str(out), "--points", str(tmp_path / "points.csv")]) == 0
-    rows = (tmp_path / "points.csv").read_text().splitlines()
-    assert sum("-M" in row.split(",")[0] for row in rows) > 40
+    assert matched_points(made, out) > 40
     ortho = ["--ccd", "F", "--strip", "scene/F", "--gsd", "400", "-q", "-o", str(tmp_path / "f.tif")]
     assert main(["rectify", str(out), *ortho]) == 0
     with rasterio.open(tmp_path / "f.tif") as image:
@@ -238,12 +243,7 @@ def test_pictures_need_no_image_points(kept, pictures, tmp_path, capsys):
     (folder / "image_points.csv").write_text("\n".join([header, *left, ""]))
     lines = f"scene/F={pictures / 'F.tif'},scene/B={pictures / 'B.tif'}"
     assert main(["import", str(folder), "--lines", lines, "-o", str(made), "-q"]) == 0
-    (tmp_path / "dgr.toml").write_text('[adjuster]\nmodel = "dgr"\n')
-    nodes = ["--nodes", "matcher,adjuster", "--config", str(tmp_path / "dgr.toml")]
-    assert main(["process", "-q", str(made), *nodes, "-o", str(out)]) == 0
-    assert main(["export", str(out), "--points", str(tmp_path / "points.csv")]) == 0
-    points = (tmp_path / "points.csv").read_text().splitlines()
-    assert sum("-M" in row.split(",")[0] for row in points) > 40
+    assert matched_points(made, out) > 40
 
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
