@@ -30,7 +30,7 @@ from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.self_calibration import SelfCalibration, calibrated, unit_of
 from ...solver.geometry.frames import CrsError, LocalFrame
 from ...solver.models.base import ERROR_GROUPS
-from .json_values import plain
+from ..formats.json_text import plain
 
 Array = NDArray[np.floating]
 

@@ -37,6 +37,7 @@ from ...solver.scene_adjustment.solution import (
     where_rays_meet,
 )
 from ..errors import UserError
+from ..formats.json_text import plain
 from ..formats.satellite.rpc_files import write_rpb
 from ..formats.scene_block import ImageEntry, SceneBlockData
 from ..formats.table import write_table
@@ -50,7 +51,6 @@ from .adjustment_result import (
     single_accuracy,
     with_height,
 )
-from .json_values import plain
 from .two_steps import sigmas_stated, step_settings
 
 Array = NDArray[np.floating]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -47,6 +46,7 @@ from ..formats.block_recording import TOPICS, block_from_messages
 from ..formats.camera_json import read_camera_instead, write_camera
 from ..formats.dem import surface_control
 from ..formats.importable import refuse_importable
+from ..formats.json_text import json_text
 from ..formats.line_orientation import write_oriented_lines
 from ..formats.new_file import new_file, refuse_unless_folder
 from ..formats.scene_block import is_scene_block
@@ -166,7 +166,7 @@ def run(args: argparse.Namespace) -> int:
         _options_of_camera_and_clock(args, len(paths))
         content = _run_block(args, paths, dem)
     if args.json:
-        print(json.dumps(content, indent=2))
+        print(json_text(content))
     else:
         for line in summary_lines(content, verbose=args.verbose):
             print(line)
@@ -555,7 +555,7 @@ def write_result(
 
         write_plots(adjustment, folder)
     with new_file(folder / "result.json") as part:
-        part.write_text(json.dumps(content, indent=2) + "\n")
+        part.write_text(json_text(content) + "\n")
 
 
 class _ProgressLines:

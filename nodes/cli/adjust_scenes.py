@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from ..batch.scene_adjustment import (
 )
 from ..batch.two_steps import OWNERS, UNUSED
 from ..errors import UserError
+from ..formats.json_text import json_text
 from ..formats.new_file import new_file
 from ..formats.scene_block import SceneBlockData, read_scene_block
 from .locate import refraction_of
@@ -102,7 +102,7 @@ def write_scene_result(adjustment: SceneAdjustment, content: dict[str, object], 
     notes = write_scene_tables(adjustment, folder)
     with_notes = content | {"notes": [*_texts(content["notes"]), *notes]}
     with new_file(folder / "result.json") as part:
-        part.write_text(json.dumps(with_notes, indent=2) + "\n")
+        part.write_text(json_text(with_notes) + "\n")
     return notes
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
+from ..formats.json_text import json_text
 from ..formats.new_file import new_file
 from ..recording.remote import path_of
 from ..recording.summary import Holdings
@@ -62,7 +62,7 @@ def _nothing(held: Holdings) -> str:
 def run(args: argparse.Namespace) -> int:
     result = write_report(args.recording, args.output)
     if args.json:
-        print(json.dumps({"report": str(args.output), **result}, indent=2))
+        print(json_text({"report": str(args.output), **result}))
     elif not args.quiet:
         lines = accuracy_lines(result)
         compared = result["orientation"] or result["points"] or result["check"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shlex
 import signal
@@ -16,6 +15,7 @@ from typing import Any
 
 from ..bus.folder_lock import locked
 from ..errors import UserError
+from ..formats.json_text import json_text
 from ..formats.new_file import refuse_unless_folder
 from ..jobs.driver import Progress, add_recorded, drive, progress_of
 from ..jobs.inputs import sources
@@ -245,7 +245,7 @@ def _list(planned: Sequence[Plan], args: argparse.Namespace) -> int:
         for plan in planned
     ]  # fmt: skip
     if args.json:
-        print(json.dumps(rows, indent=2))
+        print(json_text(rows))
         return 0
     for row in rows:
         print(f"{row['flight']}: {', '.join(row['to_do']) or 'nothing'} to do; {row['recording']}")
@@ -274,7 +274,7 @@ def _results(planned: Sequence[Plan], progress: Progress, out: Path, seconds: fl
 
 def _tell(result: dict[str, Any], args: argparse.Namespace) -> None:
     if args.json:
-        print(json.dumps(result, indent=2))
+        print(json_text(result))
         return
     from ..report.batch_rows import table_lines
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -12,6 +11,7 @@ from pathlib import Path
 from ..bus.authority import CERTIFICATE
 from ..errors import UserError
 from ..formats.importable import refuse_importable
+from ..formats.json_text import json_text
 from ..recording.reader import RecordingReader
 from ..recording.remote import RemotePath, path_of
 from ..recording.seal import verify
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
             "file": str(args.recording), "whole": not found, "messages": len(reader.index), "chunks": reader.n_chunks,
             "findings": found, "signed": signed,
         }  # fmt: skip
-        print(json.dumps(said, indent=2))
+        print(json_text(said))
         return 1 if found else 0
     if found:
         more = f" (and {len(found) - 1} more)" if len(found) > 1 and not args.verbose else ""
@@ -115,7 +115,7 @@ def _check_folder(args: argparse.Namespace) -> int:
 def _print_folder(folder: Path, problems: Sequence[str], notes: Iterable[str], held: Mapping[str, object]) -> None:
     """Print what is said of a folder as JSON."""
     said = {"folder": str(folder), "complete": not problems, **held, "problems": problems, "notes": list(notes)}
-    print(json.dumps(said, indent=2))
+    print(json_text(said))
 
 
 def _check_block(args: argparse.Namespace) -> int:

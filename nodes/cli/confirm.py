@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import getpass
-import json
 import threading
 import time
 from typing import TYPE_CHECKING, Any
@@ -16,6 +15,7 @@ from ...schemas import messages as m
 from ...schemas.envelope import RawMessage
 from ...schemas.topics import Family, find
 from ..errors import UserError
+from ..formats.json_text import json_text
 from ..node import Message
 from ..voices import is_voiced
 from .bus_options import add_bus_arguments, bus_of
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
         answered = _wait(lambda: heard.answer != "", LISTEN_S if heard.nothing else 0.0)
     if args.json:
         result = {"point": args.point, "accepted": not args.reject, "answer": heard.answer, "looks": heard.looks}
-        print(json.dumps(result, indent=2))
+        print(json_text(result))
     elif answered:
         print(heard.answer + (f"; {heard.looks} looks that were held" if heard.looks else ""))
     if answered:

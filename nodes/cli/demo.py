@@ -10,6 +10,7 @@ from typing import Any
 from ..bus.processes import NodeGroup
 from ..bus.session import port_is_held
 from ..errors import UserError
+from ..formats.json_text import json_text
 from .live_flight import ESTIMATORS, LiveFlight, add_view_arguments, seconds_between
 
 EXAMPLE = "triline demo --headless --seconds 60 --seed 7"
@@ -50,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     demo = Demo(args)
     result = demo.fly()
     if args.json:
-        print(json.dumps(for_programs(result), indent=2))
+        print(json_text(for_programs(result)))
     else:
         print(demo.summary(result))
     return 1 if "no_report" in result else 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -32,6 +31,7 @@ from ..formats.camera_json import write_camera
 from ..formats.features import NOT_PLACED, Features, answers, features_of
 from ..formats.geojson import write_geojson
 from ..formats.geopackage import write_geopackage
+from ..formats.json_text import json_text
 from ..formats.line_orientation import OrientedLines, write_oriented_lines, write_patb_lines, write_sbet_lines
 from ..formats.new_file import new_file
 from ..formats.projection import refuse_missing_grids
@@ -142,7 +142,7 @@ def run(args: argparse.Namespace) -> int:
     if kind not in _TABLES and _is_local(args.topic):
         tell_other_frame("export", reader)
     if args.json:
-        print(json.dumps(result, indent=2))
+        print(json_text(result))
         return 0
     if not args.quiet:
         what = ", ".join(f"{number} {name}" for name, number in count.items())
@@ -179,7 +179,7 @@ def _run_table(path: Path, args: argparse.Namespace) -> int:
         result |= _write_camera(recording, name, target)
     tell_other_frame("export", reader)
     if args.json:
-        print(json.dumps(result | {"damage": damage_lines(reader)}, indent=2))
+        print(json_text(result | {"damage": damage_lines(reader)}))
         return 0
     if not args.quiet:
         print(f"{path} -> {target}: {said}")

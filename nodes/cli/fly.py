@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
 import threading
 import time
@@ -16,6 +15,7 @@ from ...schemas.envelope import RawMessage
 from ..bus.processes import NodeGroup
 from ..convert import check_place
 from ..errors import UserError
+from ..formats.json_text import json_text
 from ..monitor.sensor_watch import SensorWatch
 from ..ordering import MAX_JUMP_NS
 from .live_flight import DRAIN_S, ESTIMATORS, LiveFlight, add_view_arguments, seconds_between
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     live = Fly(args, flight, programs)
     result = live.fly()
     if args.json:
-        print(json.dumps(result, indent=2))
+        print(json_text(result))
     else:
         print(live.summary(result))
     return 1 if "no_report" in result else 0

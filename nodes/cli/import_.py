@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 import time
@@ -24,6 +23,7 @@ from ..formats.geocal_xml import read_glas_camera, read_tie_points
 from ..formats.gpx import has_attitudes
 from ..formats.ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
 from ..formats.image_lines import LinesGiven, files_of
+from ..formats.json_text import json_text
 from ..formats.new_file import new_file
 from ..formats.tie_points import statistics, write_tie_points
 from ..formats.track import MOST_BORESIGHT_DEG, MOST_LEVER_ARM_M, Accuracy, Mounting
@@ -162,7 +162,7 @@ def run(args: argparse.Namespace) -> int:
     flight = {} if args.flight is None else {"flight": str(args.flight)}
     result = {"input": str(source), "kind": kind, **flight, "output": str(output), **result}
     if args.json:
-        print(json.dumps(result, indent=2))
+        print(json_text(result))
     elif not args.quiet:
         _print_summary(result)
     return 0

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from ..convert import iso
 from ..formats.importable import refuse_importable
+from ..formats.json_text import json_text
 from ..recording.access import Recording
 from ..recording.remote import path_of
 from ..recording.seal_place import seal_of
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     refuse_importable(args.recording)
     summary = _summary(Recording(args.recording))
-    print(json.dumps(summary, indent=2) if args.json else "\n".join(map(plain, _lines(summary))))
+    print(json_text(summary) if args.json else "\n".join(map(plain, _lines(summary))))
     return 0
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import asdict
 from pathlib import Path
+
+from ..formats.json_text import json_text
 
 EXAMPLE = """triline keys new survey                                   # an authority, in the folder survey
   triline keys aircraft aircraft1 --authority survey --host 10.77.0.1
@@ -69,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
             others = [member.name for member in authority.valid if member.name != args.name]
             result = {"bundle": str(bundle), "copy": [str(authority.folder / name) for name in others]}
             text = f"{bundle}: bundle of {args.action} {args.name}, for --secure" + _copy(authority.folder, others)
-    print(json.dumps(result, indent=2) if args.json else text)
+    print(json_text(result) if args.json else text)
     return 0
 
 

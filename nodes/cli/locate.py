@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from ...solver.rectification.occlusion import ground_slopes
 from ...solver.rectification.pixel_to_cell import meet_terrain
 from ..errors import UserError
 from ..formats.height_raster import DATUMS, HeightRaster
+from ..formats.json_text import json_text
 from ..formats.new_file import new_file
 from ..formats.table import Column, Table, read_table, write_table
 from .heights_under import NothingUnder, below_camera, height_range, rasters_of_heights
@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
         "notes": notes,
     }
     if args.json:
-        print(json.dumps(result, indent=2))
+        print(json_text(result))
     elif not args.quiet:
         print(f"{args.sensor} ({SENSORS[scene.kind]}, {result['model']} model) -> {args.output}")
         print(f"  {result['rows']} rows, {missed} of them miss; heights {result['heights']}")

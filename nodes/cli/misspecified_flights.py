@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from ...solver.simulation.misspecified_study import FlightFigures, Quality
-from ..batch.json_values import plain
 from ..errors import UserError
+from ..formats.json_text import plain
 
 #: What a flight goes through: with other code in these rooms it would come out otherwise.
 FLOWN_THROUGH = (

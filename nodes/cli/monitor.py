@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import threading
 
 from ..bus.program import ProgramOptions, stop_on_signals
 from ..errors import UserError
+from ..formats.json_text import json_text
 from .bus_options import add_bus_arguments, bus_of, reporter
 
 EXAMPLE = "triline monitor --fleet --secure survey/ann"
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
         options = ProgramOptions("monitor", bus_file=args.bus, stop=stop, report=report, **where)
         seen = monitor.watch_platform(options, quiet=args.quiet or args.json)
         if args.json:
-            print(json.dumps(seen.as_json(), indent=2))
+            print(json_text(seen.as_json()))
         return 0
     if args.platform is not None:
         raise UserError("--fleet and --platform: wanted one of them")
@@ -49,5 +49,5 @@ def run(args: argparse.Namespace) -> int:
             report(alone)
         overview = fleet.watch(bus, stop, "fleet", args.quiet or args.json)
     if args.json:
-        print(json.dumps({"ground": overview.ground, "aircraft": overview.rows()}, indent=2))
+        print(json_text({"ground": overview.ground, "aircraft": overview.rows()}))
     return 0

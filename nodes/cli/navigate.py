@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
@@ -27,6 +26,7 @@ from ...solver.navigation.post_processing import (
     zero_velocities,
 )
 from ..errors import UserError
+from ..formats.json_text import json_text
 from ..formats.new_file import new_file, refuse_unless_folder
 from ..formats.recorded_sensors import read_recorded_sensors
 from ..formats.sensor_folder import SensorFolder, read_sensor_folder
@@ -119,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
         with new_file(out / PAGE) as part:
             write_page(part, stretches, gnss, result)
     result["seconds"] = round(time.perf_counter() - began, 3)
-    text = json.dumps(result, indent=2)
+    text = json_text(result)
     with new_file(out / RESULT) as part:  # the last: where it is, all is there
         part.write_text(text + "\n", encoding="utf-8")
     if args.json:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shlex
 from pathlib import Path
 
 from ..errors import UserError
 from ..formats.flight_folder import write_template
+from ..formats.json_text import json_text
 from ..formats.new_file import refuse_unless_folder
 from ..formats.satellite.read import read_scene
 from ..formats.scene_block import write_scene_block
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
         command = f"triline check {shlex.quote(str(args.folder))}"
         path, todo = write_template(args.folder), f"fill it in; `{command}` says what is missing"
     if args.json:
-        print(json.dumps({"file": str(path)}, indent=2))
+        print(json_text({"file": str(path)}))
     elif not args.quiet:
         print(f"{path}: {todo}")
     return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from ..bus.live import BusRunner
 from ..bus.program import ProgramOptions, stop_on_signals, stop_with_parent
 from ..config import Tables, build, load
 from ..errors import UserError
+from ..formats.json_text import json_text
 from ..garbage_collection import RareCollections
 from ..node import Node
 from ..terminal import plain
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         code = run_on_bus(build(registry.node_class(args.name), tables, args.name), options)
     if args.json:
-        print(json.dumps({"node": args.name, "platform": options.platform, "said": said}, indent=2))
+        print(json_text({"node": args.name, "platform": options.platform, "said": said}))
     return code
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import textwrap
 import time
@@ -17,6 +16,7 @@ from ..convert import camera_from, camera_message
 from ..errors import UserError
 from ..formats.camera_json import read_camera_instead
 from ..formats.importable import refuse_importable
+from ..formats.json_text import json_text
 from ..formats.new_file import refuse_unless_file
 from ..garbage_collection import RareCollections
 from ..node import Node
@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
     seconds = time.monotonic() - begun
     if args.json:
         more = {"pace": pace, "notes": [*summary.notes, *of_camera]}
-        print(json.dumps(result(summary, reader, args.output, seconds) | more, indent=2))
+        print(json_text(result(summary, reader, args.output, seconds) | more))
         return 0
     for line in (*_lines(summary, args.output, seconds), *(f"  note: {note}" for note in of_camera)):
         print(line)

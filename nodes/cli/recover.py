@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 from pathlib import Path
 
 from ..errors import UserError
+from ..formats.json_text import json_text
 from ..formats.new_file import refuse_unless_file
 from ..recording.reader import RecordingReader
 from ..recording.summary import topic_summaries
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         "complete": reader.complete,
         "missing": missing,
     }
-    print(json.dumps(result, indent=2) if args.json else "\n".join(_lines(result)))
+    print(json_text(result) if args.json else "\n".join(_lines(result)))
     return 0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from ...solver.rectification.kernels import TAPS as IMAGE_TAPS
 from ..batch.rectification import ORIENTATIONS, Rectification, Rectified, line_blocks, project_frame
 from ..errors import UserError
 from ..formats.geotiff import write_orthoimage
+from ..formats.json_text import json_text
 from ..formats.new_file import refuse_unless_file
 from ..formats.projection import notes_of_map
 from ..recording.remote import path_of
@@ -170,7 +170,7 @@ def _check(args: argparse.Namespace) -> None:
 
 def _tell(result: dict[str, Any], done: Rectified, args: argparse.Namespace, unit: str) -> None:
     if args.json:
-        print(json.dumps(result, indent=2))
+        print(json_text(result))
         return
     lines = sum(done.strips.values())
     print(

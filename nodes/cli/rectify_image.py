@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +26,7 @@ from ...solver.rectification.sampled import SomeCells, ground_steps, metres_a_ra
 from ..batch.image_rectification import ErrorMap, Ground, ImageRectification, SourceImage, edge_of
 from ..errors import UserError
 from ..formats.height_raster import DATUMS, HeightRaster
+from ..formats.json_text import json_text
 from ..formats.new_file import refuse_unless_file
 from ..formats.projection import notes_of_map, unit_of
 from ..formats.table import Column, read_table
@@ -598,7 +598,7 @@ def _tell(
             ],
         }  # fmt: skip
     if args.json:
-        print(json.dumps(result, indent=2))
+        print(json_text(result))
         return
     print(
         f"{args.output}: {grid.rows} x {grid.columns} cells of {grid.gsd:g} {unit_of(grid.crs)} in {grid.crs}, "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import json
 import os
 import time
 from collections.abc import Callable
@@ -40,6 +39,7 @@ from ..batch.rectification import Rectification, line_blocks, project_frame
 from ..errors import UserError
 from ..formats.geotiff import is_virtual
 from ..formats.height_raster import RasterFile
+from ..formats.json_text import json_text
 from ..formats.new_file import refuse_unless_file
 from ..formats.projection import notes_of_map, unit_of
 from ..formats.stac import write_stac_item
@@ -496,7 +496,7 @@ def _result(
 
 def _tell(result: dict[str, Any], args: argparse.Namespace) -> None:
     if args.json:
-        print(json.dumps(result, indent=2))
+        print(json_text(result))
         return
     again = f", {result['continued']} jobs were done already" if result["continued"] else ""
     cells = f"{result['rows']} x {result['columns']} cells of {result['gsd']:g} {unit_of(result['crs'])}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import threading
 import time
 from pathlib import Path
@@ -13,6 +12,7 @@ from ..bus.program import stop_on_signals
 from ..bus.session import Bus
 from ..convert import iso
 from ..errors import UserError
+from ..formats.json_text import json_text
 from ..player.player import first_stamp_ns, play, time_argument
 from ..recording.reader import RecordingReader
 from .bus_options import add_bus_arguments, bus_of, reporter
@@ -74,11 +74,11 @@ def run(args: argparse.Namespace) -> int:
             )
         stop.wait(0.5)  # time for messages that are still on their way
     if args.json:
-        print(json.dumps({
+        print(json_text({
             "messages": dict(sorted(result.counts.items())), "left_out": dict(sorted(result.left_out.items())),
             "rounds": result.rounds, "worst_late_ms": round(1e3 * result.worst_late_s, 3),
             "mean_late_ms": round(1e3 * result.mean_late_s, 4), "waited_s": round(brake.held_s, 3),
-        }, indent=2))  # fmt: skip
+        }))  # fmt: skip
         return 0
     left_out = sum(result.left_out.values())
     print(

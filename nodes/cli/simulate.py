@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections import Counter
 from datetime import datetime
 from pathlib import Path
@@ -17,6 +16,7 @@ from ..batch.rectification import true_relief
 from ..batch.simulated_scenes import SceneSimulation, simulated_recording, write_simulated_scenes
 from ..errors import UserError
 from ..formats.geotiff import write_heights
+from ..formats.json_text import json_text
 from ..formats.new_file import new_file, refuse_unless_free
 from ..recording.writer import COMPRESSIONS, RecordingWriter
 from ..simulator.flight_settings import (
@@ -129,7 +129,7 @@ def run(args: argparse.Namespace) -> int:
         write_heights(Path(args.dem), true_relief(flight.simulation.flight))
     result = _summary(flight, simulator.duration_s, args.output, 1 if given["seed"] is None else given["seed"], counts)
     if args.json:
-        print(json.dumps(result, indent=2))
+        print(json_text(result))
     elif not args.quiet:
         _print_summary(result)
     return 0
@@ -172,7 +172,7 @@ def _simulate_scenes(args: argparse.Namespace, given: dict[str, Any]) -> int:
     else:
         result = write_simulated_scenes(output, what)
     if args.json:
-        print(json.dumps(result, indent=2))
+        print(json_text(result))
     elif not args.quiet:
         print(f"{result['folder']}: {result['satellite']}, images {', '.join(result['images'])}, seed {result['seed']}")
         print(f"  {result['points']} points, {result['control']} control and {result['check']} check among them; "

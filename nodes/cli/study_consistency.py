@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 
 from ...solver.simulation.consistency import MODELS, Consistency, consistency
 from ..errors import UserError
+from ..formats.json_text import json_text
 from .progress import progress
 
 EXAMPLE = "triline study consistency --seeds 200"
@@ -27,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
         with progress(label, args.quiet or args.json) as tell:
             found[label] = consistency(MODELS[name], calibrated, args.seeds, tell)
     if args.json:
-        print(json.dumps({"seeds": args.seeds, "models": {k: _plain(c) for k, c in found.items()}}, indent=2))
+        print(json_text({"seeds": args.seeds, "models": {k: _plain(c) for k, c in found.items()}}))
         return 0
     low, high = next(iter(found.values())).passed_band
     print(

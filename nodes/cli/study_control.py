@@ -7,7 +7,6 @@ of segments, order and set of additional parameters is adjusted with every numbe
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,9 +18,9 @@ from numpy.typing import NDArray
 from ...solver.adjustment.confidence_set import CONFIDENCE
 from ...solver.camera.self_calibration import SELF_CALIBRATIONS
 from ...solver.models import MODELS
-from ..batch.json_values import plain
 from ..batch.scene_adjustment import SETS
 from ..errors import UserError
+from ..formats.json_text import json_text, plain
 from ..formats.new_file import new_file, refuse_unless_file
 from ..formats.scene_block import is_scene_block, read_scene_block
 from ..formats.table import write_table
@@ -131,7 +130,7 @@ def run(args: argparse.Namespace) -> int:
     if args.page:
         _page(args.page, study)
     if args.json:
-        print(json.dumps(plain(_content(study)), indent=2))
+        print(json_text(_content(study)))
     else:
         for line in _text(study, args.verbose, args.snoop):
             print(line)

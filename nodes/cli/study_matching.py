@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from ...solver.simulation.flight import Flight
 from ..adjuster.adjuster import Adjuster
 from ..errors import UserError
+from ..formats.json_text import json_text
 from ..matcher.matcher import Matcher
 from ..navigator.navigator import Navigator
 from ..recording.reader import RecordingReader
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
             rows.append({"kind": kind, "seed": seed, **fly({**base, **KINDS[kind], "seed": seed})})
             if tell is not None:
                 tell(len(rows) / len(cases))
-    print(json.dumps(rows, indent=2) if args.json else "\n".join(lines(rows)))
+    print(json_text(rows) if args.json else "\n".join(lines(rows)))
     return 0
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import csv
 import hashlib
-import json
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -24,8 +23,8 @@ from ...solver.simulation.misspecified_study import (
     through_window,
 )
 from ...solver.simulation.real_motion import RealMotion
-from ..batch.json_values import plain
 from ..errors import UserError
+from ..formats.json_text import json_text, plain
 from ..formats.new_file import new_file, refuse_unless_file
 from ..simulator.flight_settings import GROUND_M
 from ..simulator.motion_track import motion_of
@@ -95,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         with new_file(Path(args.page)) as part:
             write_page(part, cells, f"{args.seeds} flights a row, {_flown(args)}.", words, limits_line(cells))
     if args.json:
-        print(json.dumps(document(args, cells, flights), indent=2))
+        print(json_text(document(args, cells, flights)))
     else:
         print("\n".join(lines(cells, args.seeds, _flown(args))))
     return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from ...solver.accuracy import nees_band, normalised_error_squared
 from ..adjuster.adjuster import Adjuster
 from ..errors import UserError
+from ..formats.json_text import json_text
 from ..navigator.navigator import Navigator
 from ..recording.reader import RecordingReader
 from ..recording.runner import process
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
             if tell is not None:
                 tell((seed + 1) / args.seeds)
     result = summary(flights)
-    print(json.dumps(result, indent=2) if args.json else "\n".join(lines(result)))
+    print(json_text(result) if args.json else "\n".join(lines(result)))
     return 0
 
 

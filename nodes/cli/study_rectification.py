@@ -9,7 +9,6 @@ are far off.
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +17,7 @@ import numpy as np
 
 from ...solver.rectification.comparison import METHODS, Compared, Noise, compare
 from ..errors import UserError
+from ..formats.json_text import json_text
 from ..formats.new_file import new_file, refuse_unless_file
 from ..formats.table import write_table
 
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         _page(Path(args.page), args, tables, starts)
     if args.json:
         scenes = {scene: {name: _plain(got) for name, got in table.items()} for scene, table in tables.items()}
-        print(json.dumps({"scenes": scenes, "starts": {name: _plain(got) for name, got in starts.items()}}, indent=2))
+        print(json_text({"scenes": scenes, "starts": {name: _plain(got) for name, got in starts.items()}}))
     else:
         print(_text(args, tables, starts))
     return 0

@@ -9,14 +9,13 @@ and noise are what is expected of it. ``--plot`` draws the L-curve and the cross
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
 
 from ...solver.rectification.nine_pixels import PUBLISHED, ROUNDING, conditions, curve, iterations, outcomes
-from ..batch.json_values import plain
 from ..errors import UserError
+from ..formats.json_text import json_text, plain
 from ..formats.new_file import new_file, refuse_unless_file
 
 EXAMPLE = "triline study regularisation --draws 200 --plot l-curve.png"
@@ -50,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     if args.plot:
         _plot(Path(args.plot), args.seed)
     if args.json:
-        print(json.dumps({"sets": plain(rows)}, indent=2))
+        print(json_text({"sets": plain(rows)}))
         return 0
     print(
         "condition numbers, Frobenius norm, parameters in units of what is known beforehand (the source's are unknown)"

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 
 from ...solver.simulation.scene_study import CONFIGURATIONS, SENSORS, ErrorRatio, error_over_sigma
 from ..errors import UserError
+from ..formats.json_text import json_text
 from .progress import progress
 
 EXAMPLE = "triline study scenes --seeds 50"
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
             }
             for key, r in found.items()
         ]  # fmt: skip
-        print(json.dumps({"seeds": args.seeds, "rows": rows}, indent=2))
+        print(json_text({"seeds": args.seeds, "rows": rows}))
         return 0
     print(f"{args.seeds} simulated blocks a row, 80 points, 9 of them control; errors drawn as assumed")
     print(f"{'':34s}{'RMSE / sigma':>20s}{'RMSE, m':>24s}{'sigma, m':>24s}")

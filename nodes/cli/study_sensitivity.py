@@ -12,7 +12,6 @@ draws the maps.
 from __future__ import annotations
 
 import argparse
-import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -46,6 +45,7 @@ from ...solver.sensitivity.study import Study, study
 from ...solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass
 from ..errors import UserError
 from ..formats.frame_json import is_frame_json, read_frame
+from ..formats.json_text import json_text
 from ..formats.new_file import new_file, refuse_unless_file
 from ..formats.satellite.read import read_scene
 from ..formats.table import write_table
@@ -156,7 +156,7 @@ def run(args: argparse.Namespace) -> int:
         with new_file(Path(args.page)) as part:
             write_page(part, results, maps)
     if args.json:
-        print(json.dumps({"scenes": results}, indent=2))
+        print(json_text({"scenes": results}))
     else:
         print("\n\n".join(_as_text(result) for result in results))
     return 0

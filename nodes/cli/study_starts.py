@@ -8,7 +8,6 @@ the live orientation images the ground (what a target is looked for with).
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -24,6 +23,7 @@ from ...solver.simulation.flight import Flight, pixel_angle
 from ...solver.simulation.scenario import Simulation
 from ..adjuster.adjuster import Adjuster
 from ..errors import UserError
+from ..formats.json_text import json_text
 from ..matcher.matcher import Matcher
 from ..navigator.navigator import Navigator
 from ..node import Message
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
             rows.append(row)
             if tell is not None:
                 tell(len(rows) / len(cases))
-    print(json.dumps(rows, indent=2) if args.json else "\n".join(lines(rows)))
+    print(json_text(rows) if args.json else "\n".join(lines(rows)))
     return 0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import textwrap
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from ...solver.simulation.published_tables import NETWORKS
 from ...solver.simulation.testfield_study import Row, study
 from ...solver.simulation.testfields import TESTFIELDS, Published
 from ..errors import UserError
+from ..formats.json_text import json_text
 from .progress import progress
 
 EXAMPLE = "triline study testfields --seeds 10 --only pavia2000 zurich"
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
             rows = study(fields, args.seeds, tell)
     if args.json:
         plain = {"networks": [_plain_sigma(row) for row in promised], "rows": [_plain(row) for row in rows]}
-        print(json.dumps({"seeds": args.seeds, **plain}, indent=2))
+        print(json_text({"seeds": args.seeds, **plain}))
         return 0
     for line in sigma_table(promised, args.seeds):
         print(line)

@@ -9,7 +9,6 @@ errors, points, looks, their times, their sigmas, and control as it was measured
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
@@ -26,6 +25,7 @@ from ...solver.simulation.flight import Flight
 from ...solver.simulation.observations import find_looks
 from ..adjuster.adjuster import Adjuster
 from ..errors import UserError
+from ..formats.json_text import json_text
 from ..matcher.matcher import Matcher
 from ..navigator.navigator import Navigator
 from ..node import Message
@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
             if tell is not None:
                 tell(len(rows) / len(cases))
     if args.json:
-        print(json.dumps(rows))
+        print(json_text(rows, indent=None))
     else:
         print("\n".join(lines(rows)))
     return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
 import signal
 import sys
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import UserError
+from ..formats.json_text import json_text
 from ..formats.new_file import new_file
 from ..node import Message
 from ..voices import VERDICT, RecordedVoices
@@ -150,7 +150,7 @@ def _fleet(args: argparse.Namespace) -> int:
             process.close()
     if args.rrd is not None and args.json:
         shown = {"recordings": [str(path) for path in args.recording], "mode": f"rrd:{args.rrd}", "messages": used}
-        print(json.dumps(shown, indent=2))
+        print(json_text(shown))
     elif args.rrd is not None and not args.quiet:
         print(f"{args.rrd}: {used} messages; open it with `rerun {shlex.quote(str(args.rrd))}`", flush=True)
     return 0
@@ -182,7 +182,7 @@ def show(messages, canvas, truth: bool = True) -> Counter[str]:
 def _say(args: argparse.Namespace, mode: str, counts: Counter[str], url: str | None) -> None:
     if args.json:
         shown = {"recording": str(args.recording), "mode": mode, "messages": dict(sorted(counts.items()))}
-        print(json.dumps(shown | ({"url": url} if mode == "web" else {}), indent=2), flush=True)
+        print(json_text(shown | ({"url": url} if mode == "web" else {})), flush=True)
     elif mode == "web":
         print(f"{url}\nCtrl-C stops the viewer", flush=True)
     elif args.rrd is not None and not args.quiet:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
@@ -11,6 +10,7 @@ from typing import Any
 from ...schemas import topics
 from ...solver.window.quality.determinability import ESTIMATED
 from .. import convert
+from ..formats.json_text import plain
 from ..recording.summary import Holdings, TopicSummary
 from .evaluation import evaluate_flight
 from .flight import Flight, updates_with_new_rays
@@ -66,7 +66,7 @@ def analyse(flight: Flight, held: Holdings) -> dict[str, Any]:
         {"time_s": float(flight.seconds(stamp)), "level": _level(body), "node": body.name, "text": body.message}
         for stamp, body in flight.events
     ]
-    return finite(result)
+    return plain(result)
 
 
 def _unusable(flight: Flight, row: TopicSummary) -> int | None:
@@ -136,14 +136,3 @@ def _rejected(r: Any) -> dict[str, Any]:
 
 def _level(log: Any) -> str:
     return log.DESCRIPTOR.fields_by_name["level"].enum_type.values_by_number[log.level].name.lower()
-
-
-def finite(value: Any) -> Any:
-    """The same with None in place of infinite numbers and NaN, which JSON does not have."""
-    if isinstance(value, dict):
-        return {key: finite(v) for key, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ..formats.json_text import json_text
 from ..jobs.driver import Progress
 from ..jobs.plan import Plan
 from ..jobs.records import read_record, write_whole
@@ -114,7 +115,7 @@ def _told(plan: Plan, name: str) -> dict[str, Any]:
 
 def write_tables(out: Path, result: dict[str, Any]) -> None:
     """Write summary.json and summary.csv."""
-    write_whole(out / "summary.json", json.dumps(result, indent=1) + "\n")
+    write_whole(out / "summary.json", json_text(result, indent=1) + "\n")
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(_COLUMNS)

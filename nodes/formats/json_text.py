@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,3 +24,8 @@ def plain(value: Any) -> Any:
     if isinstance(value, (float, np.floating)):
         return float(value) if np.isfinite(value) else None
     return value
+
+
+def json_text(value: Any, indent: int | None = 2) -> str:
+    """A value as the text of a JSON document, that any reader of JSON takes."""
+    return json.dumps(plain(value), indent=indent, allow_nan=False)
