@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ...solver.adjustment.block_data import BlockData, KnownPoints
 from ...solver.adjustment.control_choice import spread_choice
 from ...solver.adjustment.job import Job
+from ...solver.adjustment.single_looks import single_looks as flight_looks
 from ...solver.camera.self_calibration import SELF_CALIBRATIONS
 from ...solver.models.ppm import PpmOptions
 from ...solver.scene_adjustment.functional import R_e_enu
@@ -107,7 +108,9 @@ class Found:
     Attributes
     ----------
     check : (k,) names of the check points that it determined
-    difference_m, sigma_m : (k, 3) adjusted minus given, and theoretical sigmas, a posteriori
+    difference_m, sigma_m : (k, 3) adjusted minus given, and theoretical sigmas, a posteriori; at the given heights, and
+        these NaN, of points of one image point (`Pool.single`)
+    given_m2 : (k,) what the given coordinates add to the variance of a difference, all its coordinates together
     n_unknowns : of images: orientation, camera, corrections; without coordinates of points
     sigma0, passed : and whether its chi-square test passed
     """
@@ -115,6 +118,7 @@ class Found:
     check: tuple[str, ...]
     difference_m: Array
     sigma_m: Array
+    given_m2: Array
     n_unknowns: int
     redundancy: int
     sigma0: float
@@ -136,10 +140,12 @@ class Run:
 
 @dataclass(frozen=True)
 class Settings:
-    """Of all runs: data snooping, and iterations at most (None: as many as are usual)."""
+    """Of all runs: data snooping, iterations at most (None: as many as are usual), and whether check points have one
+    image point each (`Pool.single`)."""
 
     snoop: bool = False
     iterations: int | None = None
+    single: bool = False
 
 
 class Block(Protocol):
@@ -195,6 +201,11 @@ class _OfData(Generic[D]):
     def with_ground(self, ground: KnownPoints) -> Self:
         return replace(self, data=replace(self.data, ground=ground))
 
+    def given_variance(self, ids: Sequence[str]) -> Array:
+        """Variances of the given coordinates of known points, all three together (k,), m2."""
+        place = {id: k for k, id in enumerate(self.ground.id)}
+        return np.einsum("nii->n", self.ground.covariance[[place[id] for id in ids]].reshape(-1, 3, 3))
+
 
 @dataclass(frozen=True)
 class AirborneBlock(_OfData[BlockData]):
@@ -240,11 +251,18 @@ class AirborneBlock(_OfData[BlockData]):
         )  # fmt: skip
         result = adjust_block(block, job).result
         network, solution = result.network, result.solution
-        points = network.check.point
-        d = result.adjusted_points()[points] - network.check.xyz_l
-        sure = np.isfinite(d).all(axis=1) & ~np.isin(points, [doubt.point for doubt in result.doubtful])
+        if settings.single:
+            alone = flight_looks(solution, result.cofactors, result.sigma0)
+            points, d, sigma = alone.point, _in_plan(alone.difference_m), _in_plan(alone.sigma_m)
+            given = _added(alone.sigma_m, alone.expected_m)
+            wanted = np.isfinite(d[:, :2]).all(axis=1)
+        else:
+            points, d = network.check.point, result.adjusted_points()[network.check.point] - network.check.xyz_l
+            given = self.given_variance([network.point_ids[p] for p in points])
+            sigma, wanted = result.point_sigma_m[points], np.isfinite(d).all(axis=1)
+        sure = wanted & ~np.isin(points, [doubt.point for doubt in result.doubtful])
         return Found(
-            tuple(network.point_ids[p] for p in points[sure]), d[sure], result.point_sigma_m[points[sure]],
+            tuple(network.point_ids[p] for p in points[sure]), d[sure], sigma[sure], given[sure],
             solution.layout.n_unknowns, solution.redundancy, result.test.sigma0, result.test.passed,
             bool(solution.converged), 0,
         )  # fmt: skip
@@ -302,13 +320,30 @@ class SceneBlock(_OfData[SceneBlockData]):
             iterations=settings.iterations or SceneJob.iterations,
         )  # fmt: skip
         a = run_scene_job(data, job)
-        points, d = differences(a, "check")
-        sigma, finite = point_sigmas(a)[points], np.isfinite(d).all(axis=1)
+        if settings.single:
+            alone = a.single_looks
+            points, d = data.rays.point[alone.rays], _in_plan(alone.difference_m)
+            given = _added(alone.sigma_m, alone.expected_m)
+            sigma, finite = _in_plan(alone.sigma_m), np.isfinite(d[:, :2]).all(axis=1)
+        else:
+            points, d = differences(a, "check")
+            given = self.given_variance([data.point_ids[p] for p in points])
+            sigma, finite = point_sigmas(a)[points], np.isfinite(d).all(axis=1)
         return Found(
-            tuple(data.point_ids[p] for p in points[finite]), d[finite], sigma[finite],
+            tuple(data.point_ids[p] for p in points[finite]), d[finite], sigma[finite], given[finite],
             a.problem.block.layout.n_unknowns, a.solution.redundancy, a.test.sigma0, a.test.passed,
             bool(a.solution.converged), len(a.solution.undetermined),
         )  # fmt: skip
+
+
+def _in_plan(values: Array) -> Array:
+    """Values of two coordinates (k, 2) with the third, which is not known (k, 3)."""
+    return np.column_stack([values, np.full(len(values), np.nan)])
+
+
+def _added(sigma_m: Array, expected_m: Array) -> Array:
+    """What the given coordinates add to the variance of both coordinates together (k,)."""
+    return np.sum(np.square(expected_m) - np.square(sigma_m), axis=1)
 
 
 def _count(number: int, what: str) -> str:
@@ -358,13 +393,16 @@ class Pool:
     possible : (p,) places in the known points of those that become control or check points
     always : (c,) places of those that can only be check points, since they state no sigma
     fixed : (f,) planimetric and height points: control in every run
-    lost : (l,) places of those with less than two image points, which take no part
+    lost : (l,) places of those with less image points than are wanted, which take no part
+    single : no point has two image points, as in one scene alone or one strip of one CCD line: one is wanted, and
+        check points are compared at their given heights; else two are wanted
     """
 
     possible: Indices
     always: Indices
     fixed: Indices
     lost: Indices
+    single: bool = False
 
     @property
     def most(self) -> int:
@@ -376,21 +414,25 @@ def pool_of(block: Block) -> Pool:
     """Raises UserError where there is nothing that could be a check point."""
     ground, rays = block.ground, block.measured()
     role = np.array(ground.role, dtype=object)
-    seen = np.array([rays.get(id, 0) > 1 for id in ground.id], dtype=bool)
     full = (role == "control") | (role == "check")
+    count = np.array([rays.get(id, 0) for id in ground.id], dtype=np.int64)
+    single = not (full & (count > 1)).any()
+    seen = count >= (1 if single else 2)
     variance = np.einsum("nii->ni", ground.covariance).reshape(-1, 3)
     stated = (variance > 0).all(axis=1)
-    pool = Pool(*(np.flatnonzero(m) for m in (full & seen & stated, full & seen & ~stated, ~full, full & ~seen)))
+    parts = (full & seen & stated, full & seen & ~stated, ~full, full & ~seen)
+    pool = Pool(*(np.flatnonzero(m) for m in parts), single=single)
     if len(pool.possible) + len(pool.always) == 0:
-        what = "known points" if not len(ground) else "control or check points with two image points"
+        what = "known points" if not len(ground) else "control or check points with image points"
         raise UserError(f"{block.name}: no {what}, so that nothing can be checked; wanted some in ground_points.csv")
     return pool
 
 
 def default_numbers(pool: Pool) -> tuple[int, ...]:
-    """0, 4, 9, 16, 25 control points, as far as there are, and as half of the points at least stay check points."""
+    """0, 4, 9, 16, 25 control points, as far as there are, and as half of the points at least stay check points; not 0
+    where single image points determine nothing without."""
     n = len(pool.possible) + len(pool.always)
-    return (0, *(k for k in (4, 9, 16, 25) if k <= min(pool.most, n // 2)))
+    return (*(() if pool.single and pool.most >= 4 and n >= 8 else (0,)), *(k for k in (4, 9, 16, 25) if k <= min(pool.most, n // 2)))
 
 
 def with_control(block: Block, pool: Pool, number: int) -> tuple[Block, tuple[str, ...]]:

@@ -32,8 +32,9 @@ class Row:
     ----------
     rmse_m, sigma_m : (3,) of its check points, and their predicted sigmas, root of the mean variance
     n_check : check points it determined
-    rmse_3d_m, expected_3d_m : in space, of the check points that all compared runs have in common, and what the sigmas
-        of adjusted and of given coordinates let expect; NaN for a run that is not compared
+    rmse_3d_m, expected_3d_m : in space (in plan where the third coordinate is not known), of the check points that all
+        compared runs have in common, and what the sigmas of adjusted and of given coordinates let expect; NaN for a
+        run that is not compared
     told_apart : whether the check points tell it from the best
     as_good : they do not, and its predicted sigmas are not larger than those of the best (`LARGER_SIGMA`)
     note : why it is not compared, and other remarks
@@ -72,6 +73,11 @@ class Study:
     suspicious: dict[str, float]
 
     @property
+    def where(self) -> str:
+        """What errors of points are lengths in."""
+        return "in plan" if self.pool.single else "in space"
+
+    @property
     def enough(self) -> bool:
         """Whether there are check points enough to tell configurations apart."""
         return len(self.common) >= LEAST_POINTS
@@ -94,15 +100,14 @@ def judge(block: Block, pool: Pool, control: dict[int, tuple[str, ...]], runs: S
     common = tuple(id for id in places if sets and all(id in s for s in sets.values()))
     if not sets or not common:
         return Study(block, pool, control, tuple(rows), (), None, None, {})
-    given = np.einsum("nii->n", block.ground.covariance[[places[id] for id in common]])
     squares, variance = np.empty((len(sets), len(common))), np.empty((len(sets), len(common)))
     for i, k in enumerate(sets):
         found = rows[k].run.found
         assert found is not None
         place = {id: n for n, id in enumerate(found.check)}
         mine = [place[id] for id in common]
-        squares[i] = np.sum(found.difference_m[mine] ** 2, axis=1)
-        variance[i] = np.sum(found.sigma_m[mine] ** 2, axis=1) + given
+        squares[i] = np.nansum(found.difference_m[mine] ** 2, axis=1)
+        variance[i] = np.nansum(found.sigma_m[mine] ** 2, axis=1) + found.given_m2[mine]
     inside = confidence_set(np.sqrt(squares))
     for i, k in enumerate(sets):
         rmse, expected = (float(np.sqrt(values[i].mean())) for values in (squares, variance))
@@ -148,7 +153,7 @@ def verdict(study: Study) -> Iterator[str]:
         yield "nothing can be compared: no run is without fault; the table says why"
         return
     yield (
-        f"best: {_named(best)}: RMSE in space {metres(best.rmse_3d_m).strip()} m, the smallest of {len(compared)} "
+        f"best: {_named(best)}: RMSE {study.where} {metres(best.rmse_3d_m).strip()} m, the smallest of {len(compared)} "
         f"({best.rmse_3d_m / best.expected_3d_m:.2f} times what the sigmas let expect)"
     )
     if best.rmse_3d_m > min(row.rmse_3d_m for row in compared):
@@ -162,8 +167,8 @@ def verdict(study: Study) -> Iterator[str]:
     least = min(compared, key=lambda row: row.expected_3d_m)
     if least is not best:
         yield (
-            f"by predicted sigmas alone: {_named(least)}: {metres(least.expected_3d_m).strip()} m in space; its RMSE "
-            f"is {least.rmse_3d_m / least.expected_3d_m:.2f} times that"
+            f"by predicted sigmas alone: {_named(least)}: {metres(least.expected_3d_m).strip()} m {study.where}; "
+            f"its RMSE is {least.rmse_3d_m / least.expected_3d_m:.2f} times that"
         )
 
 

@@ -116,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
     work = Work(
         {number: part for number, (part, _) in parts.items()},
         tuple((number, c) for number in numbers for c in configurations),
-        Settings(args.snoop, args.iterations),
+        Settings(args.snoop, args.iterations, pool.single),
     )
     with progress("configurations", args.quiet or args.json) as tell:
         runs = run_all(work, args.jobs or cores(), tell)
@@ -168,13 +168,17 @@ def _numbers(wanted: Sequence[int] | None, block: Block, pool: Pool) -> tuple[in
 def _text(study: Study, verbose: bool, snooped: bool) -> Iterator[str]:
     pool, block = study.pool, study.block
     n = len(pool.possible) + len(pool.always)
-    yield f"{block.name}: {n} known points with two image points or more, {len(pool.possible)} of them can be control"
+    rays = "one image point each" if pool.single else "two image points or more"
+    yield f"{block.name}: {n} known points with {rays}, {len(pool.possible)} of them can be control"
+    if pool.single:
+        yield "check points are compared in plan, at their given heights: no image point but one sees them"
     if len(pool.always):
         yield f"{len(pool.always)} state no sigma and are check points in every run"
     if len(pool.fixed):
         yield f"{len(pool.fixed)} planimetric and height points are control in every run and not counted"
     if len(pool.lost):
-        yield f"{len(pool.lost)} have less than two image points and take no part"
+        missing = "no image point" if pool.single else "less than two image points"
+        yield f"{len(pool.lost)} have {missing} and take no part"
     yield from (f"note: {note}" for note in block.notes)
     yield RULE
     if verbose:
@@ -229,6 +233,7 @@ def _content(study: Study) -> dict[str, Any]:
         "control": {number: list(ids) for number, ids in study.control.items()},
         "common_check": list(study.common),
         "axes": list(study.block.axes),
+        "compared": study.where,
         "notes": list(study.block.notes),
         "confidence": CONFIDENCE,
         "check_points_enough": study.enough,
@@ -289,10 +294,11 @@ def _figure(study: Study) -> Any:
     colours = {n: colormaps["viridis"](0.9 * k / max(len(numbers) - 1, 1)) for k, n in enumerate(numbers)}
     x, y, z = study.block.axes
     fig = figure(1.5 + 0.24 * len(labels))
-    panels = fig.subplots(1, 2, sharey=True)
-    for ax, part, name in ((panels[0], slice(0, 2), f"{x}, {y}"), (panels[1], slice(2, 3), z)):
+    shown_in = [(slice(0, 2), f"{x}, {y}")] + ([] if study.pool.single else [(slice(2, 3), z)])
+    panels = fig.subplots(1, len(shown_in), sharey=True, squeeze=False)[0]
+    for ax, (part, name) in zip(panels, shown_in, strict=True):
         for row in study.rows:
-            if not np.isfinite(row.rmse_m).all():
+            if not np.isfinite(row.rmse_m[part]).all():
                 continue
             n, colour = row.run.control, colours[row.run.control]
             at = labels.index(row.run.configuration.label) + 0.5 * (numbers.index(n) + 0.5) / len(numbers) - 0.25

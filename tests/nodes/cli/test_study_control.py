@@ -271,6 +271,47 @@ def test_blocks_that_cannot_be_checked(air, pair, tmp_path, capsys):
     assert "wanted 0 to 0 for simulated spot5-hrs; 24 of its 24 known points state no sigma" in capsys.readouterr().err
 
 
+def only(folder, copy, **wanted):
+    """The block with the image points of one strip or CCD line alone."""
+    shutil.copytree(folder, copy)
+    with open(folder / "image_points.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    kept = [row for row in rows if all(row[key] == value for key, value in wanted.items())]
+    assert 0 < len(kept) < len(rows)
+    with open(copy / "image_points.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(kept)
+    return copy
+
+
+@pytest.mark.parametrize("kind", ["a scene alone", "a strip of one CCD line"])
+def test_points_of_one_image_point_are_compared_in_plan(kind, pair, air, tmp_path, capsys):
+    """A block of one scene was refused: no point has two image points."""
+    if kind == "a scene alone":
+        folder, words = only(pair, tmp_path / "one", ccd="F"), ["--control", "4", "9"]
+    else:
+        folder, words = only(air, tmp_path / "one", strip="C1", ccd="N"), ["--control", "4", "--selfcal", "none"]
+    picture, page = tmp_path / "c.svg", tmp_path / "c.html"
+    words += ["--model", "dgr", "--plot", str(picture), "--page", str(page)]
+    found = study(capsys, folder, *words)
+    assert found["compared"] == "in plan" and found["points"]["possible"]
+    best = found["rows"][found["best"]]
+    assert best["rmse_m"][2] is None and best["sigma_m"][2] is None
+    assert 0.4 < best["rmse_3d_common_m"] / best["expected_3d_common_m"] < 1.6
+    for row in found["rows"]:
+        single = as_adjusted(capsys, folder, found, row)["check_single"]
+        assert row["n_check"] == single["n"] > 5
+        np.testing.assert_allclose(row["rmse_m"][:2], single["rmse_m"][:2], rtol=1e-6)
+        np.testing.assert_allclose(row["sigma_m"][:2], single["sigma_m"][:2], rtol=1e-6)
+        if row["n_check"] == len(found["common_check"]):
+            expected = np.hypot(*single["expected_m"][:2])
+            assert row["expected_3d_common_m"] == pytest.approx(expected, rel=1e-6)
+    assert "in plan" in page.read_text() and "<svg" in picture.read_text()
+    assert main(["study", "control", str(folder), "--jobs", "1", "--control", "4", "--model", "dgr"]) == 0
+    assert "compared in plan, at their given heights" in capsys.readouterr().out
+
+
 @pytest.mark.study
 def test_how_often_check_points_tell_the_wrong_way(tmp_path):
     """More control, and the model of the true errors, are better; check points of one block say so or say nothing."""
