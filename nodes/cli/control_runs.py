@@ -432,7 +432,8 @@ def default_numbers(pool: Pool) -> tuple[int, ...]:
     """0, 4, 9, 16, 25 control points, as far as there are, and as half of the points at least stay check points; not 0
     where single image points determine nothing without."""
     n = len(pool.possible) + len(pool.always)
-    return (*(() if pool.single and pool.most >= 4 and n >= 8 else (0,)), *(k for k in (4, 9, 16, 25) if k <= min(pool.most, n // 2)))
+    some = tuple(k for k in (4, 9, 16, 25) if k <= min(pool.most, n // 2))
+    return some if pool.single and some else (0, *some)
 
 
 def with_control(block: Block, pool: Pool, number: int) -> tuple[Block, tuple[str, ...]]:

@@ -11,11 +11,10 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from ...solver.camera.line_camera import LineCamera
-from ...solver.camera.sensors import PRESETS, preset
+from ...solver.camera.sensors import PRESETS
 from ..errors import UserError
 from ..formats.avirisc import LINE_RATE_HZ, avirisc_has_latitudes
-from ..formats.camera_json import read_camera, write_camera
+from ..formats.camera_json import write_camera
 from ..formats.detect import KINDS, Imported, Options, image_alone, kind_of_path, read_any
 from ..formats.envi_image import TYPES
 from ..formats.flight_folder import FILE, NAVIGATION, Instead, flight_messages
@@ -24,6 +23,7 @@ from ..formats.gpx import has_attitudes
 from ..formats.ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
 from ..formats.image_lines import LinesGiven, files_of
 from ..formats.json_text import json_text
+from ..formats.named_camera import camera_named
 from ..formats.new_file import new_file
 from ..formats.tie_points import statistics, write_tie_points
 from ..formats.track import MOST_BORESIGHT_DEG, MOST_LEVER_ARM_M, Accuracy, Mounting
@@ -150,7 +150,7 @@ def run(args: argparse.Namespace) -> int:
             args.crs,
             Mounting(args.lever_arm or Mounting.lever_arm_m, args.boresight or Mounting.boresight_deg),
             args.line_rate or LINE_RATE_HZ,
-            None if args.camera is None else read_camera_of(args.camera, of_camera),
+            None if args.camera is None else camera_named(args.camera, "--camera", of_camera),
             args.seconds_of_day,
             _accuracy(args),
             _lines(args, kind),
@@ -269,25 +269,6 @@ def _accuracy(args: argparse.Namespace) -> Accuracy:
     x, y, z = position or default.position_m
     omega, phi, kappa = attitude or default.attitude_deg
     return Accuracy((x, y, z), (omega, phi, kappa), position is not None, attitude is not None)
-
-
-def read_camera_of(text: str, notes: list[str]) -> LineCamera:
-    """A camera from a file (camera.json or AVIRIS-NG XML) or by the name of a preset.
-
-    Parameters
-    ----------
-    notes : gets remarks
-
-    Raises
-    ------
-    UserError : none of these
-    """
-    path = Path(text)
-    if path.is_file():
-        return read_glas_camera(path) if path.suffix.lower() == ".xml" else read_camera(path, notes)
-    if text in PRESETS:
-        return preset(text)
-    raise UserError(f"--camera {text}: no such file, and no preset of that name; presets: {', '.join(PRESETS)}")
 
 
 def _import_camera(source: Path, output: Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...solver.camera.line_camera import LineCamera
-from ...solver.camera.sensors import preset, with_pixels
+from ...solver.camera.sensors import with_pixels
 from ...solver.navigation.inertial_data import MEMS, TACTICAL
 from ...solver.simulation.error_models import ErrorModel
 from ...solver.simulation.flight import FlightPlan
@@ -22,6 +22,7 @@ from ...solver.simulation.real_motion import HIGH_ALTITUDE_ERRORS, RealMotion, c
 from ...solver.simulation.scenario import ObservationPlan, Simulation, simulate, simulate_real_motion
 from .. import convert
 from ..errors import UserError
+from ..formats.named_camera import camera_named
 from .motion_track import motion_of
 from .world_settings import world_from
 
@@ -66,7 +67,12 @@ OPTIONS: tuple[Option, ...] = (
         "heights of the ground lie within +- this, m (default 75; real motion up to 150)",
         "general",
     ),
-    Option("sensor", str, "camera preset (default ads40; real motion above 5 km: one for 20 km)", "general"),
+    Option(
+        "sensor",
+        str,
+        "camera: a preset, or its camera.json (default ads40; real motion above 5 km: one for 20 km)",
+        "general",
+    ),
     Option("strips", int, "parallel strips", "plan", "strips"),
     Option("cross", int, "strips across them", "plan", "cross_strips"),
     Option("height", float, "above mean ground, m", "plan", "height_m"),
@@ -238,7 +244,7 @@ def _fields(values: Mapping[str, Any], group: str) -> dict[str, Any]:
 
 
 def _camera(values: Mapping[str, Any], sensor: str) -> LineCamera:
-    camera = preset(values.get("sensor", sensor))
+    camera = camera_named(values.get("sensor", sensor), "simulation: sensor")
     return with_pixels(camera, values["pixels"]) if "pixels" in values else camera
 
 

@@ -92,6 +92,11 @@ class FlightPlan:
             raise ValueError(
                 f"flight plan: wanted a camera with one lens, {self.camera.name} has {len(self.camera.lenses)}"
             )
+        way = np.abs([line.xy_mm[-1] - line.xy_mm[0] for line in self.camera.lines])
+        if (way[:, 0] > way[:, 1]).any():
+            raise ValueError(
+                f"flight plan: CCD lines of {self.camera.name} lie along x, wanted along y: across the flight"
+            )
         if self.strips < 1:
             raise ValueError(f"flight plan: wanted at least one strip, got {self.strips}")
         if not 0 <= self.sidelap < 1:

@@ -236,11 +236,21 @@ def test_recording_holds_the_flight(tmp_path, capsys):
     assert all(numbers == list(range(len(numbers))) for numbers in by_topic.values())
 
 
+def test_a_camera_whose_lines_lie_along_the_flight_is_refused(tmp_path, capsys):
+    """It would see the ground along its own track."""
+    line = {"id": "N", "lens": "L", "pixels": 100, "pixel_size_mm": 0.1, "center_mm": [0, 0], "inclination_deg": 90}
+    camera = {"lenses": [{"id": "L", "focal_length_mm": 50}], "lines": [line]}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    assert main(["simulate", "-o", str(tmp_path / "x.mcap"), "--sensor", str(tmp_path / "camera.json")]) == 1
+    error = capsys.readouterr().err
+    assert "lie along x, wanted along y: across the flight" in error and error.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     "options, words",
     [
         (["--strips", "0"], "at least one strip"),
-        (["--sensor", "leica"], "known: ads40"),
+        (["--sensor", "leica"], "presets: ads40"),
         (["--sensor", "alos-prism"], "one lens"),
         (["--seed", "-1"], "seed must not be negative"),
         (["--epoch", "yesterday"], "wanted a time such as"),
