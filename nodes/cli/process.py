@@ -38,7 +38,8 @@ SMOOTH_EVERY_S = 2.0
 RARE_S = 5.0
 #: Nodes whose results are as good at the pace for throughput.
 FAST = {"navigator", "matcher", "adjuster"}
-CAMERA, REPORT, ADJUSTER, NAVIGATOR = "configuration/camera", "adjustment/report", "adjuster", "navigator"
+CAMERA, REPORT, TIES, LINES = "configuration/camera", "adjustment/report", "observation/tie", "sensor/lines/*"
+NAVIGATOR, MATCHER, ADJUSTER = "navigator", "matcher", "adjuster"
 #: What an adjuster corrects, of a recording or of a navigator.
 POSES = ("trajectory/smoothed", "trajectory/filtered")
 
@@ -88,8 +89,11 @@ def run(args: argparse.Namespace) -> int:
     dem = dem_settings(args)
     if dem:
         tables = tables | {"adjuster": tables.get("adjuster", {}) | dem}
-    of_camera: list[str] = []
-    instead = {} if args.camera is None else {CAMERA: _camera(reader, args.camera, of_camera)}
+    notes: list[str] = []
+    instead = {} if args.camera is None else {CAMERA: _camera(reader, args.camera, notes)}
+    if ADJUSTER in names and MATCHER not in names and not len(reader.select([TIES])) and len(reader.select([LINES])):
+        more = ",".join([*names[: names.index(ADJUSTER)], MATCHER, *names[names.index(ADJUSTER) :]])
+        notes.append(f"image lines and no tie point in it; '--nodes {more}' finds tie points")
     nodes: list[Node] = [build(registry.node_class(name), tables) for name in names]
     begun = time.monotonic()
     part = args.output.with_name(args.output.name + ".part")
@@ -120,10 +124,10 @@ def run(args: argparse.Namespace) -> int:
         part.unlink(missing_ok=True)
     seconds = time.monotonic() - begun
     if args.json:
-        more = {"pace": pace, "notes": [*summary.notes, *of_camera]}
+        more = {"pace": pace, "notes": [*summary.notes, *notes]}
         print(json_text(result(summary, reader, args.output, seconds) | more))
         return 0
-    for line in (*_lines(summary, args.output, seconds), *(f"  note: {note}" for note in of_camera)):
+    for line in (*_lines(summary, args.output, seconds), *(f"  note: {note}" for note in notes)):
         print(line)
     if pace != args.pace and pace == "throughput" and ADJUSTER in summary.nodes:
         print("  live orientation is that of updates 10 s apart; that of a flight comes with --pace load")

@@ -343,9 +343,11 @@ class LookMatcher:
         """
         p, place = self.prediction, track.place
         known = np.flatnonzero(track.found)
-        half = 0.5 * np.diagonal(track.covariance[known], axis1=1, axis2=2)
+        turn = np.stack([p.turn(p.others[j]) for j in known])
+        own_half = 0.5 * np.diagonal(track.covariance[known], axis1=1, axis2=2)
+        half = 0.5 * np.einsum("nij,njk,nik->ni", turn, track.covariance[known], turn)
         floor = 0.5 * p.options.image_sigma_px**2
-        own = half.mean(axis=0) * px[0] ** 2 + floor if place.variance is None else np.array(place.variance)
+        own = own_half.mean(axis=0) * px[0] ** 2 + floor if place.variance is None else np.array(place.variance)
         own = own + wobble[0]
         ccd = p.views[p.master].ccd
         rays = [MatchedRay(ccd, place.line, place.sample, float(own[0] ** 0.5), float(own[1] ** 0.5))]

@@ -141,6 +141,10 @@ class Prediction:
         spacing = sample_m(scan, centre_l, np.full(len(centre_l), scan.first_line + len(scan.position_l) // 2))
         return Ground(centre_l, *self._axes, spacing)
 
+    def turn(self, index: int) -> Array:
+        """(2, 2) from the axes of the grids on the ground, along and across, to those of a view's lines."""
+        return np.eye(2)
+
     def reach(self, index: int, ground: Ground, sigma_height: Array, parallax: Array) -> float:
         """Three sigma of the prediction in px: orientation of both looks, height, and what the past has shown."""
         o = self.options

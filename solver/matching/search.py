@@ -183,6 +183,30 @@ def _between(grid: Array, nodes: Array) -> Array:
     return np.stack([np.interp(grid, nodes, row) for row in np.eye(len(nodes))])
 
 
+class TurnedImage:
+    """An image on grids that lie in any direction to its lines.
+
+    Attributes
+    ----------
+    way : (2,) direction in which its lines follow each other on the ground, of length 1
+    """
+
+    def __init__(self, image: Image, way: Array):
+        self.image, self.way = image, way
+        # a shift along the rows moves so many lines: what `find` takes for the way from line to line
+        self.line_m = image.line_m
+
+    def select(self, chosen: Mask) -> TurnedImage:
+        """An image is the same for all places."""
+        return self
+
+    def patches(self, ground: Ground, line: Array, half: int, factor: int) -> Patches:
+        """See `Imagery`."""
+        middle = self.image.scan.locate(ground.centre_l, line, rounds=4)[0]
+        lines_per = np.array([self.way @ ground.along, self.way @ ground.across]) * ground.spacing_m / self.line_m
+        return self.image.patches(ground, np.where(np.isfinite(middle), middle, line), half, factor, lines_per)
+
+
 @dataclass(frozen=True)
 class Found:
     """Where k places of the master were found in another view.

@@ -15,7 +15,7 @@ from .looks import verdict
 from .options import Place
 from .places import CHUNK_S, LEAST_CHUNK
 from .prediction import WIDE, Prediction, sample_m
-from .search import CORRELATION_HALF, REACH_PX, Ground, Image, Patches, coarsest_factor, find
+from .search import CORRELATION_HALF, REACH_PX, Image, TurnedImage, coarsest_factor, find
 
 Array = NDArray[np.floating]
 
@@ -85,7 +85,7 @@ class SeenAgain:
             scale = strip.slow.scale_px
             reach = float(np.clip(3 * np.where(np.isfinite(scale), scale, FIRST_REACH).max(), LATER_REACH, FIRST_REACH))
         # along a grid's rows the lines of this strip lie in another direction: each patch finds its own
-        image = _Turned(self._image(p.master, scan, travel), turn[0] * strip.spacing_m / travel)
+        image = TurnedImage(self._image(p.master, scan, travel), here.along)
         found = find(strip.chips(chosen), line, ground, image, expected, line, reach)
         reason = verdict(found, p.options)
         good = reason == ""
@@ -120,29 +120,6 @@ class SeenAgain:
         fine = np.asarray(agrees.all(axis=1))
         self.counters["contradiction between strips"] += int((~fine).sum())
         return [place for place, ok in zip(places, fine, strict=True) if ok]
-
-
-class _Turned:
-    """An image on grids that lie in any direction to its lines.
-
-    Attributes
-    ----------
-    lines_per : lines of the image for a step along the rows and along the columns of a grid
-    """
-
-    def __init__(self, image: Image, lines_per: Array):
-        self.image, self.lines_per = image, lines_per
-        # a shift along the rows moves so many lines: what `find` takes for the way from line to line
-        self.line_m = image.line_m
-
-    def select(self, chosen: NDArray[np.bool_]) -> _Turned:
-        """An image is the same for all places."""
-        return self
-
-    def patches(self, ground: Ground, line: Array, half: int, factor: int) -> Patches:
-        """See `search.Imagery`."""
-        middle = self.image.scan.locate(ground.centre_l, line, rounds=4)[0]
-        return self.image.patches(ground, np.where(np.isfinite(middle), middle, line), half, factor, self.lines_per)
 
 
 def _visible(strip: StripChips, scan: LineScan, first: int, rows: int) -> tuple[Array, Array, NDArray[np.int64]]:

@@ -29,7 +29,7 @@ from .options import MatchedRay, MatchedTie, MatchingOptions, Place, first_part_
 from .places import PlaceChooser
 from .prediction import Prediction
 from .round_earth import RADIUS_M, RoundHeights, above_sphere
-from .search import LEAST_SQUARES_HALF, Image
+from .search import LEAST_SQUARES_HALF, Image, TurnedImage
 from .waiting import BATCH
 
 Array = NDArray[np.floating]
@@ -41,8 +41,9 @@ POSES_KEPT = 512
 #: A view is steeper than another if it looks down more steeply by this, rad. Tuned: two lenses that look forward and
 #: backward alike count as equal.
 STEEPER = np.radians(2.0)
-#: No ground lies higher above the sphere, m, than the highest mountain.
-HIGHEST_GROUND_M = 9000.0
+#: No ground lies higher above the sphere, m, than the highest mountain, or nearer below the platform than this share of
+#: the way down to the lowest.
+HIGHEST_GROUND_M, LEAST_ABOVE = 9000.0, 0.1
 #: Standard deviation of a place before anything is matched with it, px: half of what it may be at most. Tuned.
 LONE_SIGMA_PX = 0.05
 #: A satellite that turns holds the view on the ground back to this share of its own way at most; and the largest angle
@@ -133,10 +134,12 @@ class _StripView:
         down = -position - np.array([0.0, 0.0, RADIUS_M])
         return float(np.arccos(np.clip(ray @ down / np.linalg.norm(down), -1.0, 1.0)))
 
-    def image(self, scan: LineScan, travel: float) -> Image:
-        """Its lines, for patches; the platform's way from line to line is given."""
+    def image(self, scan: LineScan, travel: float) -> TurnedImage:
+        """Its lines, for patches along any other strip; the platform's way from line to line is given."""
         assert self.ring is not None
-        return Image(scan, self.ring, travel * self.ground_share, self.lines.saturated)
+        way = scan.position_l[-1, :2] - scan.position_l[0, :2]
+        image = Image(scan, self.ring, travel * self.ground_share, self.lines.saturated)
+        return TurnedImage(image, way / np.linalg.norm(way))
 
 
 @dataclass(eq=False)
@@ -192,6 +195,31 @@ class _PairPrediction(Prediction):
         steps = np.stack(np.meshgrid(far if along_too else np.zeros(1), far, indexing="ij"), axis=-1).reshape(-1, 2)
         nearest = steps[np.argsort(np.hypot(*steps.T), kind="stable")]
         return list(step * nearest @ np.stack([along, across]))
+
+    def turn(self, index: int) -> Array:
+        """See `Prediction`."""
+        here, there = self.whole
+        if index == 0 or here is None or there is None:
+            return np.eye(2)
+        a, b = (
+            way / np.linalg.norm(way) for way in (s.position_l[-1, :2] - s.position_l[0, :2] for s in (here, there))
+        )
+        cosine, sine = a @ b, a[0] * b[1] - a[1] * b[0]
+        return np.array([[cosine, sine], [-sine, cosine]])
+
+    def angle(self, places: list[Place]) -> float:
+        """Angle at which the rays of both views meet on the ground, rad: the median of places; 0 where none is seen."""
+        here, there = self.whole
+        which = self.seen(places)
+        if here is None or there is None or not which.any():
+            return 0.0
+        line, sample = np.array([[p.line, p.sample] for p, sees in zip(places, which, strict=True) if sees]).T
+        point, _ = here.to_plane(line, sample, np.full(len(line), self.heights.prior_m))
+        other, _ = _located(there, point)
+        rays = [point - s.position_l[np.clip(np.nan_to_num(at).astype(int) - s.first_line, 0, len(s.position_l) - 1)]
+                for s, at in ((here, line), (there, other))]  # fmt: skip
+        a, b = (ray / np.linalg.norm(ray, axis=1)[:, None] for ray in rays)
+        return float(np.median(np.arcsin(np.clip(np.linalg.norm(np.cross(a, b), axis=1), 0.0, 1.0))))
 
     def seen(self, places: list[Place]) -> NDArray[np.bool_]:
         """Which places lie in the lines of the other view, about."""
@@ -506,7 +534,7 @@ class StripMatcher:
             return False
         some = _some(tracks)
         prior, o = p.heights.prior_m, self.options
-        heights = self._heights_tried(p, pair).tolist()
+        heights = self._heights_tried(p, [track.place for track in some]).tolist()
         tried = [(height, beside, o.largest_reach_px) for beside in p.beside(along_too=False) for height in heights]
         # a narrow search finds the ground in short strips too, where it is as high as it is thought to be
         for height, beside, reach in [(prior, np.zeros(2), o.least_reach_px), *tried]:
@@ -525,13 +553,14 @@ class StripMatcher:
         p.slow.forget()
         return False
 
-    def _heights_tried(self, p: Prediction, pair: tuple[_StripView, _StripView]) -> Array:
+    def _heights_tried(self, p: _PairPrediction, places: list[Place]) -> Array:
         """Heights of the ground, the likeliest first; a search at one of them reaches to the next."""
-        sine = np.linalg.norm(np.cross(pair[0].middle()[1], pair[1].middle()[1]))
+        sine = np.sin(p.angle(places))
         pixel = p.height_and_travel()[0] * p.views[0].pitch_mm / p.views[0].focal_length_mm
         step = 2 * (1 - OVERLAP) * self.options.largest_reach_px * pixel / max(float(sine), 1e-3)
         prior, low = p.heights.prior_m, min(p.heights.lowest_m, p.heights.prior_m)
-        below, higher = (int(np.ceil(max(reach, 0.0) / step)) for reach in (prior - low, HIGHEST_GROUND_M - prior))
+        high = min(HIGHEST_GROUND_M, p.platform_m - LEAST_ABOVE * (p.platform_m - low))
+        below, higher = (int(np.ceil(max(reach, 0.0) / step)) for reach in (prior - low, high - prior))
         steps = np.arange(-below, higher + 1)
         return prior + step * steps[np.argsort(np.abs(steps), kind="stable")]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import cache
 from heapq import merge
@@ -14,11 +15,13 @@ from scipy.spatial.transform import Rotation
 
 from triline.nodes.adjuster.adjuster import Adjuster
 from triline.nodes.batch.simulated_scenes import SceneSimulation, simulated_recording, write_with_sensors
+from triline.nodes.cli import main
 from triline.nodes.convert import pose_message, pose_sample
 from triline.nodes.formats.block_recording import block_from_messages
 from triline.nodes.formats.scene_block import read_scene_block
 from triline.nodes.formats.scene_recording import local_block
 from triline.nodes.matcher.matcher import Matcher
+from triline.nodes.recording.reader import RecordingReader
 from triline.schemas.topics import rank
 from triline.solver.adjustment.adjustment import adjust
 from triline.solver.adjustment.block_data import network_from_block
@@ -174,6 +177,49 @@ def test_overpasses_of_one_lens():
     assert len({tie.body.point for tie in first}) == len(first) and len(later) > 0.8 * len(first)
     assert {tie.body.point for tie in later} <= {tie.body.point for tie in first}
     assert later[0].stamp_ns - first[-1].stamp_ns > 2.9 * 86_400e9
+
+
+CAMERA = """{"name": "hyper", "lenses": [{"id": "L1", "focal_length_mm": 25.0}],
+ "lines": [{"id": "N", "lens": "L1", "pixels": 500, "pixel_size_mm": 0.0384, "center_mm": [0.05, 0.0]}]}"""
+
+
+def test_strips_of_one_ccd_line_in_any_direction_are_tied_by_their_images_alone(tmp_path, capsys):
+    """Two strips in opposite directions and one across them, a camera of the user's own, no control, ground unknown.
+
+    Lines in another direction were taken for shaken ones: strips of one direction alone were tied.
+    """
+    sensor, flight, out = tmp_path / "camera.json", tmp_path / "flight.mcap", tmp_path / "out.mcap"
+    sensor.write_text(CAMERA)
+    plan = ["--strips", "2", "--cross", "1", "--sidelap", "0.6", "--seconds", "12", "--height", "1000", "--speed", "60"]
+    simulate = ["simulate", "-q", "-o", str(flight), "--sensor", str(sensor), "--images", *plan, "--no-turns"]
+    assert main([*simulate, "--control", "0", "--check", "0", "--lead-in", "3", "--seed", "3"]) == 0
+    capsys.readouterr()
+    assert main(["process", str(flight), "-o", str(out), "-q", "--processes", "1"]) == 0
+    assert "note: image lines and no tie point in it; '--nodes navigator,matcher,adjuster'" in capsys.readouterr().out
+    nodes = ["--nodes", "navigator,matcher,adjuster", "--processes", "1"]
+    assert main(["process", str(flight), "-o", str(out), "-q", *nodes]) == 0
+    assert "note:" not in capsys.readouterr().out
+    seen, said = {}, []
+    for message in RecordingReader(out).messages(["observation/tie", "event/log"]):
+        if message.topic == "observation/tie":
+            for image in message.body.images:
+                seen.setdefault(message.body.point, set()).add(image.strip)
+        elif message.topic == "event/log":
+            said.append(message.body.message)
+    pairs = [frozenset(strips) for strips in seen.values()]
+    for pair in (("S1", "S2"), ("S1", "C1")):
+        assert sum(set(pair) <= strips for strips in pairs) > 20, pair
+    assert not any("no tie point at" in text for text in said)
+    # on line, too: the strips wait for the looks that come when they are over
+    assert main(["analyze", str(out), "--json", "-o", str(tmp_path / "r.html")]) == 0
+    result = json.loads(capsys.readouterr().out)
+    whole, alone = (result["orientation"][name] for name in ("whole", "filtered"))
+    assert 0.3 < whole["nees"] < 1.8
+    assert (np.array(whole["sigma_m"]) < 0.75 * np.array(alone["sigma_m"])).all(), whole["sigma_m"]
+    # and they fit: the batch says how well
+    assert main(["adjust", str(out), "--json", "-o", str(tmp_path / "adjusted")]) == 0
+    batch = json.loads(capsys.readouterr().out)
+    assert batch["redundancy"] > 50 and batch["sigma0"] < 1.2
 
 
 def test_lines_that_a_budget_does_not_hold():
