@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from ..arrays import IntArray
+from ..arrays import Array, IntArray
 from ..geometry.measured_trajectory import SMOOTHED_LATE_S
 from .block.backward import LeftOrientation, LeftPoints, Step
 from .block.block import Block
@@ -15,6 +15,7 @@ from .datum.drift_monitor import DriftMonitor
 from .output import OrientationOutput
 from .quality.quality_control import QualityControl
 from .results import RefinedOrientation, Refusal, Update, WindowOptions
+from .screening.first_ground import has_one_view
 from .screening.snooping import snoop
 from .screening.ties import snoop_ties
 from .state.batch import Batch
@@ -29,6 +30,10 @@ MOST_LEAVING = 1000
 #: are completed together were seen first at different times, so that at the border of a segment many batches are old
 #: at once.
 LEAVING_S, LEAST_LEAVING = 1.0, 100
+#: So long after the end of a strip of a camera with one view, s, its first looks are waited for, and so much of the
+#: strip, s, stays for them. Tuned: the first is time for a matcher to go through a strip, the second bounds the work of
+#: an update.
+AWAITED_S, MOST_AWAITED_S = 30.0, 180.0
 #: Steps kept for the backward pass of a strip too long for a block; of one that never ends the earliest part is not
 #: refined again.
 MOST_STEPS = 600
@@ -83,6 +88,9 @@ class Leaving:
         self._let_go_s = now_s
         limits = {}
         for strip in self._network.strips.values():
+            if limit_s < np.inf and self._is_awaited(strip, now_s):  # else it is the end of the flight
+                limits[strip.id] = min(limit_s, now_s - MOST_AWAITED_S)
+                continue
             settled_s = -np.inf
             if self._is_settled(strip, now_s):
                 settled_s = _until(self._network.of_strip(strip), MOST_LEAVING + 1, np.inf)
@@ -151,6 +159,14 @@ class Leaving:
             return True
         return smoothed_s >= strip.end_s and not any(b.provisional for b in self._network.of_strip(strip))
 
+    def _is_awaited(self, strip: WindowStrip, now_s: float) -> bool:
+        """Whether a strip of a camera with one view has no look yet, but may have some when it is over: a matcher finds
+        its points in other strips, so they come together."""
+        network = self._network
+        if strip.id in network.intake.looked or not has_one_view(network.camera, network.strips):
+            return False
+        return not strip.ended or now_s < strip.end_s + AWAITED_S
+
     def _bearable_s(self, limit_s: float, passed_s: float) -> float:
         """The limit, or an earlier one where more is older than may leave in an update so long after the one before."""
         if not np.isfinite(limit_s) or passed_s >= LEAVING_S:
@@ -197,13 +213,17 @@ GIVE_UP_EVERY_S = 1.0
 KEPT_TOGETHER = 12
 #: Batches whose points say about how far away the ground is.
 GROUND_BATCHES = 32
+#: How far below the camera, m, looks are linearised as long as nobody knows how far away the ground is: anything in
+#: front of the camera, as they are linearised anew when it is known.
+NOBODY_KNOWS_M = 1000.0
 
 
 class SingleLooks:
     """Gives up waiting for partners of looks, and keeps what can be kept for the block.
 
     Such looks say nothing of their strip, but a later strip may see their point again. Before the unknowns of their
-    time leave the window they are linearised.
+    time leave the window they are linearised. A camera with one view places no point in its first strip: its looks are
+    kept, and placed when a later strip has shown where the ground is (`first_ground`).
     """
 
     def __init__(self, network: LiveNetwork, block: Block, sources: DriftMonitor) -> None:
@@ -253,10 +273,27 @@ class SingleLooks:
         ground.sort(key=lambda b: abs(b.oldest_s - times[0]))
         placed = [b.points_l[b.normals.rank == 3] for b in ground[:GROUND_BATCHES]]
         near = np.concatenate(placed) if any(map(len, placed)) else self._ground_l
-        batch = self._maker.make_single(names, points, near) if len(near) else None
+        near = near if len(near) else self._on_surface(times)
+        unplaced = not len(near)
+        if unplaced:
+            if not has_one_view(self._network.camera, self._network.strips):
+                return  # the strip itself will place points
+            near = self._network.trajectory.at(np.array(times)).poses.position_l - [0.0, 0.0, NOBODY_KNOWS_M]
+        elif self._block.groundless:
+            self._block.ground_found(float(np.median(near[:, 2])))
+        batch = self._maker.make_single(names, points, near)
         if batch is not None:
             looks = [p.looks[0] for p in points]
-            self._block.keep_single(batch, looks, self._sources.cell_of_single(batch))
+            self._block.keep_single(batch, looks, self._sources.cell_of_single(batch), unplaced)
+
+    def _on_surface(self, times: list[float]) -> Array:
+        """Places (m, 3) of the surface that points lie on below the camera at some times; none where it has none."""
+        surface = self._network.surface.control
+        if surface is None:
+            return np.empty((0, 3))
+        xy = self._network.trajectory.at(np.array(times)).poses.position_l[:, :2]
+        places = np.column_stack([xy, surface.height(*xy.T)])
+        return places[np.isfinite(places[:, 2])]
 
 
 def _until(batches: Iterable[Batch], most_rays: float, otherwise_s: float) -> float:

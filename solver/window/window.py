@@ -33,9 +33,10 @@ from .output import CostHistory, OrientationOutput, WindowReport, WindowUpdate, 
 from .quality.light import Fit
 from .quality.quality_control import QualityControl
 from .results import Look, RefinedOrientation, WindowOptions
-from .screening.arriving import Arrivals, usual_length
+from .screening.arriving import SINGLE_VIEW_WINDOW_S, Arrivals, usual_length
 from .screening.consensus import ConsensusSchedule, consensus_weights
 from .screening.disagreement import Disagreement
+from .screening.first_ground import has_one_view
 from .screening.sigma_check import SigmaCheck
 from .screening.snooping import reweigh, snoop
 from .state.batch import Batch
@@ -295,8 +296,11 @@ class Window:
         result.tell_alone()
         for batch in fresh:
             self._newest_ray_s = max(self._newest_ray_s, batch.newest_s)
-        if not self._length_s and fresh and not any(lens_of(self.camera, id) for id in self.strips):
-            self._length_s = usual_length(self.camera, fresh[0], self.options.window_looks)
+        if not self._length_s and self.strips:
+            if has_one_view(self.camera, self.strips):
+                self._length_s = SINGLE_VIEW_WINDOW_S
+            elif fresh and not any(lens_of(self.camera, id) for id in self.strips):
+                self._length_s = usual_length(self.camera, fresh[0], self.options.window_looks)
         return fresh
 
     def _solve(self, fresh: list[Batch]) -> int:

@@ -79,12 +79,14 @@ class Archive:
     Attributes
     ----------
     strips, points : by name, oldest first
+    unplaced : names of single looks whose points were not about known when they were kept (`KeptPoint.unplaced`)
     changed : whether information was added since the last solution
     """
 
     def __init__(self, shared_columns: IntArray, shared_sigma: Array):
         self.strips: dict[str, KeptStrip] = {}
         self.points: dict[str, KeptPoint] = {}
+        self.unplaced: set[str] = set()
         self._shared = shared_columns
         self._normals = BlockNormals()
         self.add(shared_columns, np.diag(shared_sigma**-2.0), np.zeros(len(shared_columns)))
@@ -170,8 +172,13 @@ class Archive:
             seen = frozenset(r.look.strip for r in point.residuals)
             self._keep(point.name, KeptPoint(left, i, seen, float(time_s[at]), batch.control.weight[at]))
 
-    def keep_single(self, batch: Batch, looks: Sequence[Look], cell: Cell | None) -> None:
-        """Keep looks that found no partner in their strip: a batch of points with one each."""
+    def keep_single(self, batch: Batch, looks: Sequence[Look], cell: Cell | None, unplaced: bool) -> None:
+        """Keep looks that found no partner in their strip: a batch of points with one each.
+
+        Parameters
+        ----------
+        unplaced : nobody knows yet how far away their points are; see `place_single`
+        """
         for i, look in enumerate(looks if self.holds(batch.columns) else ()):
             name = batch.names[i]
             if name in self.points and self.points[name].single is None:
@@ -179,7 +186,24 @@ class Archive:
             single = SingleLook(batch, i, look, cell)
             seen, time_s = frozenset((look.strip,)), float(batch.rays.time_s[i])
             if (left := single.left()) is not None:
-                self._keep(name, KeptPoint(left, 0, seen, time_s, np.zeros(3), single))
+                self._keep(name, KeptPoint(left, 0, seen, time_s, np.zeros(3), single, unplaced))
+                if unplaced:
+                    self.unplaced.add(name)
+
+    def place_single(self, height_m: float) -> None:
+        """Linearise the looks that are not placed where their rays come to the height of the ground; those whose rays
+        do not are forgotten."""
+        for name in self.unplaced:
+            kept = self.points.get(name)
+            if kept is None or kept.single is None or not kept.unplaced:
+                continue
+            place_l = kept.single.place_above(height_m)
+            left = None if place_l is None else kept.single.left(place_l)
+            if left is None:
+                del self.points[name]
+            else:
+                self.points[name] = replace(kept, left=left, unplaced=False)
+        self.unplaced.clear()
 
     def linearise_single(self, solution: BlockSolution) -> Parts:
         """Linearise single looks at a solution, so that the ties to them in the window are as good as it; in parts.

@@ -23,7 +23,7 @@ from ..state.network import LiveNetwork
 from ..state.points import ControlPoint
 from ..state.strip import WindowStrip
 from .archive import BLOCK_UNKNOWNS, MOST_OF_STRIP, MOST_POINTS, Archive, KeptStrip
-from .backward import LeftOrientation, LeftPoints, Step, backward
+from .backward import BlockSolution, LeftOrientation, LeftPoints, Step, backward
 from .ties import EarlierStrips
 
 #: Floating point operations of the work on the block for each second of platform time: about a tenth of a core. Tuned.
@@ -54,6 +54,7 @@ class Block:
         self._archive = Archive(network.shared_columns, self._shared_sigma)
         self._touched: set[str] = set()
         self._new: list[str] = []
+        self._solved: tuple[BlockSolution, frozenset[str]] | None = None  # the last solution, and the strips in it
         self._full = 0
         self._work: Parts | None = None
         self._worked_s = -np.inf
@@ -73,11 +74,33 @@ class Block:
         self._touched.update(names[i] for i in batch.strips)
         self._archive.leave(batch, left, cell, update)
 
-    def keep_single(self, batch: Batch, looks: Sequence[Look], cell: Cell | None) -> None:
-        """Keep looks that found no partner in their strip, a batch of one each."""
+    def keep_single(self, batch: Batch, looks: Sequence[Look], cell: Cell | None, unplaced: bool) -> None:
+        """Keep looks that found no partner in their strip, a batch of one each; see `Archive.keep_single`."""
         self.conclude()
         self._touched.update(look.strip for look in looks)
-        self._archive.keep_single(batch, looks, cell)
+        self._archive.keep_single(batch, looks, cell, unplaced)
+
+    @property
+    def groundless(self) -> bool:
+        """Whether looks are kept of which nobody knows how far away their points are."""
+        return bool(self._archive.unplaced)
+
+    def unplaced_ray(self, name: str, strip: str) -> tuple[Array, Array] | None:
+        """Position (3,) and direction (3,) of a kept look at a point from another strip, if its place is not known."""
+        kept = self._archive.points.get(name) if name in self._archive.unplaced else None
+        if kept is None or kept.single is None or not kept.unplaced or strip in kept.strips:
+            return None
+        return kept.single.ray_l
+
+    def ground_found(self, height_m: float) -> None:
+        """It is known now how high the ground is, metres in the local frame: looks that waited for it tie later strips,
+        at once where nothing else does."""
+        self.conclude()
+        self._archive.place_single(height_m)
+        if self._solved is not None and not self.earlier.points and not self.earlier.present:
+            solution, strips = self._solved
+            for _ in self.earlier.learning(self._archive, solution, set(self._archive.strips) - strips):
+                pass
 
     def orientation(self, strip: WindowStrip, final: LeftOrientation) -> None:
         """Orientation that became final."""
@@ -199,7 +222,9 @@ class Block:
     def _refining(self, wanted: Sequence[str], at_the_end: bool) -> Parts:
         """Solve the block, refine strips, close the oldest if there are too many, prepare ties to them; in parts."""
         named = self.drifts
+        strips = frozenset(self._archive.over)
         solution = yield from self._archive.solving(named)
+        self._solved = solution, strips
         closing = self._archive.beyond()
         for ids in (wanted, *([id] for id in closing)):
             self._tell((yield from self._archive.refining(solution, ids)))

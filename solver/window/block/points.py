@@ -34,6 +34,7 @@ class KeptPoint:
     time_s : mean time of its rays in the last of them
     control : (3,) weights of known coordinates that count in it, 1/m^2
     single : the look, if it is one that found no partner in its strip
+    unplaced : it is such a look, and nobody knows yet how far away the ground is
     """
 
     left: LeftPoints
@@ -42,6 +43,7 @@ class KeptPoint:
     time_s: float
     control: Array
     single: SingleLook | None = None
+    unplaced: bool = False
 
     @property
     def functions(self) -> EliminatedPoints:
@@ -78,6 +80,18 @@ class SingleLook:
     place: int
     look: Look
     cell: Cell | None
+
+    @property
+    def ray_l(self) -> tuple[Array, Array]:
+        """Where it was taken from (3,), and where it looks (3,), local frame."""
+        position_l = self.batch.rays.position_l[self.place]
+        return position_l, self.batch.points_l[self.place] - position_l
+
+    def place_above(self, height_m: float) -> Array | None:
+        """Where its ray comes to a height (3,); None if it does not."""
+        position_l, ray = self.ray_l
+        share = (height_m - position_l[2]) / ray[2] if ray[2] else -1.0
+        return position_l + share * ray if share > 0.0 else None
 
     def place_at(self, control: ControlPoint) -> Array | None:
         """Where along its ray (3,) it meets known coordinates best; None if these do not tell it well."""

@@ -113,7 +113,7 @@ class EarlierStrips:
         members: dict[tuple[str, int], list[str]] = {}
         order = {id: i for i, id in enumerate(archive.strips)}
         for name, kept in archive.points.items():
-            if kept.strips.isdisjoint(without):
+            if kept.strips.isdisjoint(without) and not kept.unplaced:
                 strip = max(kept.strips, key=order.__getitem__)
                 part = int(kept.time_s // PATCH_S) if len(archive.strips[strip].entered) > 4 * MOST_MODES else 0
                 members.setdefault((strip, part), []).append(name)

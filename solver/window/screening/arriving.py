@@ -13,15 +13,14 @@ from ..state.maker import BatchMaker, Draft
 from ..state.network import LiveNetwork
 from .disagreement import Disagreement
 from .entry import EntryEquations, disagreement
+from .first_ground import FirstGround
 from .snooping import admit
 from .ties import ON_ENTRY, contradicting, drop_weak, meet, set_apart
 
-#: Views whose base over height is less place no point within a strip: those of a camera with one CCD line, or with
-#: lines side by side for colours. Tuned; cameras with views to several sides have ten times as much.
-LEAST_BASE = 0.05
-#: Window of such a camera, s: its points hang on other strips and on control, for which no window waits long enough.
-#: Tuned: with 10, 20 and 40 s whole points are the same; a longer one makes updates slower and final orientation later.
-SINGLE_VIEW_WINDOW_S = 40.0
+#: Window of a camera with one view, s: its points hang on other strips and on control, for which no window waits long
+#: enough. Tuned: with 10, 20 and 40 s whole points are the same as long as all of them tie; a longer one makes updates
+#: slower and final orientation later, and meets so much of the strips beside it at a time that not all points tie.
+SINGLE_VIEW_WINDOW_S = 10.0
 
 
 class Arrivals:
@@ -36,6 +35,7 @@ class Arrivals:
     def __init__(self, network: LiveNetwork, block: Block, newest: Disagreement, step_s: float, snoop: bool) -> None:
         self._network, self._block, self._newest, self._maker = network, block, newest, BatchMaker(network)
         self._step_s, self._snoop = step_s, snoop
+        self._first_ground = FirstGround(network, block, self._maker)
 
     def take(self, update: Update) -> list[Batch]:
         """Batches of the points that have new looks with a measured orientation; others wait."""
@@ -45,6 +45,8 @@ class Arrivals:
             return []
         self._block.conclude()  # points are about to be looked up among those of earlier strips
         names = [name for name, point in news.items() if point.batch is None and point.looks]
+        if self._block.groundless:
+            names = list(dict.fromkeys(names + self._first_ground.look()))
         known: dict[str, Array] = {}
         for batch in {id(p.batch): p.batch for p in news.values() if p.batch is not None}.values():
             known |= dict(zip(batch.names, batch.points_l, strict=True))
@@ -99,10 +101,8 @@ class Arrivals:
 
 def usual_length(camera: LineCamera, batch: Batch, looks: float) -> float:
     """Length of the window, s: so many times the time between the first and the last look at a point, from view angles,
-    height and speed."""
+    height and speed. For a camera with several views."""
     base = float(np.ptp(camera.ahead_mm / camera.focal_length_mm))
-    if base < LEAST_BASE:
-        return SINGLE_VIEW_WINDOW_S
     height = float(np.median(batch.rays.position_l[:, 2] - batch.points_l[batch.rays.point, 2]))
     speed = float(np.median(np.linalg.norm(batch.rays.velocity_l, axis=1)))
     return looks * base * height / max(speed, 1.0)

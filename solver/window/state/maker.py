@@ -91,8 +91,8 @@ class BatchMaker:
         return self.make_each([draft], known)[0]
 
     def make_single(self, names: list[str], points: list[PointLooks], ground_l: Array) -> Batch | None:
-        """A batch of points of one look each, linearised where its ray meets the ground at the height of the nearest
-        known point.
+        """A batch of points of one look each, linearised where its ray meets the ground: the surface that points lie
+        on, or else the height of the nearest known point.
 
         Parameters
         ----------
@@ -103,10 +103,14 @@ class BatchMaker:
         direction = np.einsum("nij,nj->ni", matrix_from_angles(*rays.angles.T), image)
         direction /= direction[:, 2:]
         height = np.full(len(names), np.median(ground_l[:, 2]))
+        surface = self.network.surface.control
         for _ in range(NEAREST):
             place = rays.position_l + (height - rays.position_l[:, 2])[:, None] * direction
             apart = ((ground_l[:, :2] - place[:, None, :2]) ** 2).sum(axis=2)
             height = ground_l[np.argmin(apart, axis=1), 2]
+            if surface is not None:
+                on_surface = surface.height(place[:, 0], place[:, 1])
+                height = np.where(np.isfinite(on_surface), on_surface, height)
         place = rays.position_l + (height - rays.position_l[:, 2])[:, None] * direction
         batch = self.make(Draft(names, points), dict(zip(names, place, strict=True)))
         if batch is not None:  # onto the ray as it is corrected

@@ -79,11 +79,13 @@ class Intake:
     ----------
     points : all points that are not final
     control : known coordinates by point
+    looked : names of the strips of which a look was ever taken
     """
 
     def __init__(self, camera: LineCamera, strips: dict[str, WindowStrip], trajectory: MeasuredTrajectory):
         self.points: dict[str, PointLooks] = {}
         self.control: dict[str, ControlPoint] = {}
+        self.looked: set[str] = set()
         self._camera, self._strips, self._trajectory = camera, strips, trajectory
         self._arrived: dict[str, None] = {}
         self._waiting: dict[str, None] = {}
@@ -109,6 +111,7 @@ class Intake:
         point = self.points.get(name)
         if point is None:  # what was refused of it in an earlier strip is in doubt
             point = self.points[name] = PointLooks(out=set(self._out_before.get(name, ())))
+        self.looked.add(look.strip)
         point.looks.append(look)
         point.time_s.append(time_s)
         point.weight.append(1.0)

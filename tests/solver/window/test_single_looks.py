@@ -11,10 +11,11 @@ from three_strips import OPTIONS, PLAN, SIDE_BY_SIDE, TIES, flown, usual, usual_
 from triline.solver.camera.line_camera import LineCamera
 from triline.solver.camera.self_calibration import left_by_calibration
 from triline.solver.simulation.window_study import adjust_at_once, adjust_online, orientation_errors
+from triline.solver.window import leaving
 from triline.solver.window.block import archive, points
 from triline.solver.window.block.points import SingleLook
 from triline.solver.window.results import TAKEN_BACK
-from triline.solver.window.screening import arriving
+from triline.solver.window.screening import first_ground
 from triline.solver.window.state.maker import BatchMaker
 
 ALONE = "too few looks"
@@ -74,11 +75,10 @@ def test_points_of_single_looks_lie_where_the_looks_meet(monkeypatch):
         assert np.abs((whole.xyz_l - wanted.xyz_l) / sigma).max() < 0.1
 
 
-def test_a_camera_with_one_ccd_line_has_a_window_of_its_own_and_loses_no_ties(monkeypatch):
+def test_a_camera_with_one_ccd_line_has_a_window_of_its_own_and_loses_no_ties():
     """The window was as long as the strip, so that updates took longer and longer. Here the only control lies at the
     beginning of the first strip: when looks that wait for the next strip leave the window, no point in it tells the
     height of the ground any more."""
-    monkeypatch.setattr(arriving, "SINGLE_VIEW_WINDOW_S", 10.0)
     camera = PLAN.camera
     nadir = camera.lines[camera.line_index["N"]]
     one = LineCamera("one", tuple(lens for lens in camera.lenses if lens.id == nadir.lens), (nadir,))
@@ -99,6 +99,56 @@ def test_a_camera_with_one_ccd_line_has_a_window_of_its_own_and_loses_no_ties(mo
     off = np.array([p.xyz_l - place[p.name] for p in ties])
     C = np.array([p.covariance for p in ties])
     assert 0.4 < np.einsum("ni,ni->n", off, np.linalg.solve(C, off[:, :, None])[:, :, 0]).mean() / 3.0 < 1.6
+
+
+def test_one_ccd_line_without_control_ties_its_strips(monkeypatch):
+    """Nobody says where the ground is, 700 m nearer than looks are linearised at first: none of them tied anything."""
+    monkeypatch.setattr(leaving, "NOBODY_KNOWS_M", 2200.0)
+    camera = PLAN.camera
+    nadir = camera.lines[camera.line_index["N"]]
+    one = LineCamera("one", tuple(lens for lens in camera.lenses if lens.id == nadir.lens), (nadir,))
+    simulation, poses = flown(replace(PLAN, camera=one), replace(TIES, control=0))
+    online = adjust_online(simulation, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
+    batch = adjust_at_once(simulation, poses, OPTIONS)
+    ties = {name: p for name, p in batch.final_points.items() if p.rays > 1}
+    met = [name for name in ties if name in online.whole_points]
+    assert len(met) > 0.95 * len(ties) > 50
+    for name in met:
+        sigma = np.sqrt(np.diag(ties[name].covariance))
+        assert np.abs((online.whole_points[name].xyz_l - ties[name].xyz_l) / sigma).max() < 0.3
+        assert np.sqrt(np.diag(online.whole_points[name].covariance)) == pytest.approx(sigma, rel=0.1)
+    # the strips are final as they are flown, not when they are over
+    assert max(known - o.time_s[-1] for known, o in zip(online.final_known_s, online.final, strict=True)) < 25.0
+
+
+def test_strips_of_one_ccd_line_without_any_look_are_final(monkeypatch):
+    """Their looks are waited for, not longer than 30 s after the strip, with no more of it than is bearable, and at the
+    end of the flight no longer."""
+    monkeypatch.setattr(leaving, "AWAITED_S", 4.0)
+    monkeypatch.setattr(leaving, "MOST_AWAITED_S", 10.0)
+    camera = PLAN.camera
+    nadir = camera.lines[camera.line_index["N"]]
+    one = LineCamera("one", tuple(lens for lens in camera.lenses if lens.id == nadir.lens), (nadir,))
+    simulation, poses = flown(replace(SIDE_BY_SIDE, camera=one), replace(TIES, control=0))
+    none = replace(simulation, images=simulation.images.select(np.zeros(len(simulation.images.looks), dtype=bool)))
+    online = adjust_online(none, poses, OPTIONS, live=False, update_s=0.5)
+    for k, (begin, end) in enumerate(simulation.flight.strip_times_s):
+        mine = [i for i, o in enumerate(online.final) if o.strip == simulation.flight.strips[k].id]
+        time_s = np.concatenate([online.final[i].time_s for i in mine])
+        assert time_s.min() < begin + 0.5 and time_s.max() > end - 0.5
+        late_s = [online.final_known_s[i] - online.final[i].time_s[0] for i in mine]
+        assert max(late_s) < 22.0
+        assert k > 0 or min(late_s) > 3.0
+
+
+def test_rays_say_how_high_they_meet():
+    to = np.array([[100.0, 50.0, 20.0], [0.0, 0.0, -30.0], [0.0, 0.0, 0.0], [10.0, 0.0, 500.0]])
+    a, b = np.array([[0.0, 0.0, 1000.0]] * 4), np.array([[400.0, 100.0, 1100.0]] * 4)
+    b[2] = [0.0, 10.0, 1000.0]  # nearly parallel
+    rays = [to - a, 3.0 * (to - b)]
+    rays[0][3] *= -1.0  # behind the camera
+    height = first_ground.meeting_heights(a, rays[0], b, rays[1])
+    assert height[:2] == pytest.approx([20.0, -30.0]) and np.isnan(height[2:]).all()
 
 
 @pytest.mark.parametrize("later", [False, True])
