@@ -69,7 +69,11 @@ class StatedControl:
             self._changed.append(f"{body.point} from {before} to {role}")
         elif old != body:
             dx, dy, dz = body.x - old.x, body.y - old.y, body.z - old.z
-            self._changed.append(f"{body.point} by {dx:.2f}, {dy:.2f}, {dz:.2f} m")
+            if dx or dy or dz:
+                self._changed.append(f"{body.point} by {dx:.2f}, {dy:.2f}, {dz:.2f} m")
+            elif body.covariance != old.covariance:
+                (before, _), (after, _) = (_coordinates(b)[1:] for b in (old, body))
+                self._changed.append(f"{body.point} in its sigmas, from {_metres(before)} to {_metres(after)} m")
 
     def take_news(self) -> list[str]:
         """Lines for the operator about control that came or changed in flight since the last call."""
@@ -92,6 +96,11 @@ class StatedControl:
         (self._refused.discard if verdict.accepted else self._refused.add)(verdict.point)
         if verdict.point in self.bodies:
             self.take(self.bodies[verdict.point], window)
+
+
+def _metres(sigma: Array) -> str:
+    """Sigmas of the coordinates that are given."""
+    return ", ".join(f"{s:.2f}" for s in sigma[np.isfinite(sigma)])
 
 
 def _several(names: list[str]) -> str:

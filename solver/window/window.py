@@ -217,10 +217,16 @@ class Window:
         role : as in the messages; "check" for a point that is compared only
 
         They may come before or after the point's looks, and after it has become final: then they count in the backward
-        pass, and as soon as the strips that saw it are over also for the strip that is flown.
+        pass, and as soon as the strips that saw it are over also for the strip that is flown. What was said of the
+        point before counts no more.
         """
         point = ControlPoint(np.asarray(xyz_l, dtype=float), np.asarray(sigma_m, dtype=float), role)
-        if name not in self.network.intake.points:
+        old, counts = self.network.intake.control.get(name), self._block.knows(name)
+        changed = old is None or not old.says(point)
+        if changed:
+            self._control.restated(name)
+            self._quality.integrity.restated(name)
+        if changed if counts else name not in self.network.intake.points:
             self._block.add_control(name, point)
         self.network.intake.add_control(name, point)
 

@@ -170,7 +170,8 @@ class Archive:
         time_s = np.add.reduceat(batch.rays.time_s, batch.first_ray[:-1]) / np.diff(batch.first_ray)
         for i, (at, point) in enumerate(zip(placed.tolist(), left.points, strict=True)):
             seen = frozenset(r.look.strip for r in point.residuals)
-            self._keep(point.name, KeptPoint(left, i, seen, float(time_s[at]), batch.control.weight[at]))
+            known = batch.control.weight[at], batch.control.xyz_l[at]
+            self._keep(point.name, KeptPoint(left, i, seen, float(time_s[at]), *known))
 
     def keep_single(self, batch: Batch, looks: Sequence[Look], cell: Cell | None, unplaced: bool) -> None:
         """Keep looks that found no partner in their strip: a batch of points with one each.
@@ -186,7 +187,7 @@ class Archive:
             single = SingleLook(batch, i, look, cell)
             seen, time_s = frozenset((look.strip,)), float(batch.rays.time_s[i])
             if (left := single.left()) is not None:
-                self._keep(name, KeptPoint(left, 0, seen, time_s, np.zeros(3), single, unplaced))
+                self._keep(name, KeptPoint(left, 0, seen, time_s, np.zeros(3), np.zeros(3), single, unplaced))
                 if unplaced:
                     self.unplaced.add(name)
 
@@ -240,8 +241,9 @@ class Archive:
         if old is not None and old.single is not None:
             left = old.single.left(batch.points_l[i])
             old = None if left is None else replace(old, left=left)
-        before = np.zeros(3) if old is None else old.control
+        before, known_l = (np.zeros(3), np.zeros(3)) if old is None else (old.control, old.known_l)
         control = np.where(before > 0, 0.0, batch.ties.control[i])
+        known_l = np.where(before > 0, known_l, batch.control.xyz_l[i])
         rows = [rays] if old is None else [rays, old.functions.rows(old.place, origin)]
         point, matrix, rhs, _ = eliminated(rows, np.diag(control), batch.control.xyz_l[i], origin)
         # a point that no look is left of lies where it is known to be, and says nothing
@@ -257,14 +259,23 @@ class Archive:
             n, looks = published.rays + old.point.rays, old.point.residuals + published.residuals
             published = published._replace(rays=n, residuals=looks, checked=checks(n, len(looks), bool(control.any())))
         time_s = float(batch.rays.time_s[batch.first_ray[i] : batch.first_ray[i + 1]].mean())
-        self._keep(published.name, KeptPoint(LeftPoints(point, (published,)), 0, seen, time_s, before + control))
+        left = LeftPoints(point, (published,))
+        self._keep(published.name, KeptPoint(left, 0, seen, time_s, before + control, known_l))
         if old is not None and old.single is not None:
             update.refused.append(Refusal(published.name, old.single.look, TAKEN_BACK))
 
+    def knows(self, name: str) -> bool:
+        """Whether known coordinates count in a point that is final."""
+        return name in self.points and bool(self.points[name].control.any())
+
     def add_control(self, name: str, control: ControlPoint) -> bool:
-        """Known coordinates of a point that is final; whether they count."""
+        """Known coordinates of a point that is final, in place of others that count; whether that changes something."""
         kept, weight = self.points.get(name), control.weight
-        if kept is None or kept.control.any() or not weight.any() or not self.holds(kept.functions.columns):
+        if kept is None or not self.holds(kept.functions.columns):
+            return False
+        if kept.control.any():
+            return self._restate(name, weight, np.nan_to_num(control.xyz_l), control.role)
+        if not weight.any():
             return False
         if kept.single is not None:
             place_l = kept.single.place_at(control)
@@ -273,6 +284,15 @@ class Archive:
                 return False
             kept = replace(kept, left=left)
         self._weigh(name, kept, weight, np.nan_to_num(control.xyz_l), control.role)
+        return True
+
+    def _restate(self, name: str, weight: Array, xyz_l: Array, role: str) -> bool:
+        """Known coordinates (3,) with weights (3,), 0 where there are none, in place of those that count."""
+        old = self.points[name]
+        if (weight == old.control).all() and (xyz_l == old.known_l)[weight > 0].all():
+            return False
+        for change, value in ((weight, xyz_l), (-old.control, old.known_l)):
+            self._weigh(name, self.points[name], change, value, role)
         return True
 
     def weigh_control(self, name: str, axis: int, weight: float, value: float) -> None:
@@ -290,7 +310,8 @@ class Archive:
         point, matrix, rhs, _ = eliminated([rows], np.diag(change), xyz_l, origin)
         self.add(point.columns, matrix, rhs)
         left = LeftPoints(point, (kept.point._replace(role=role),))
-        self.points[name] = KeptPoint(left, 0, kept.strips, kept.time_s, kept.control + change)
+        known_l = np.where(change > 0, xyz_l, kept.known_l)
+        self.points[name] = KeptPoint(left, 0, kept.strips, kept.time_s, kept.control + change, known_l)
 
     # -- solution ------------------------------------------------------------------------------------------------------
 

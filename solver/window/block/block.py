@@ -121,15 +121,20 @@ class Block:
         self._archive.end_strip(strip)
         self._new.append(strip.id)
 
+    def knows(self, name: str) -> bool:
+        """Whether known coordinates count in a point that is final."""
+        return self._archive.knows(name)
+
     def add_control(self, name: str, control: ControlPoint) -> None:
-        """Known coordinates, perhaps of a point that is final already."""
+        """Known coordinates, perhaps of a point that is final already, and of which others counted."""
         self.conclude()
+        came = "was changed" if self.knows(name) else "came"
         if not self._archive.add_control(name, control):
             return
         if self.earlier.add_control(name, control):
-            self.events.append(f"control {name} came after its point was final: it counts from now on")
+            self.events.append(f"control {name} {came} after its point was final: it counts from now on")
         elif self._new or self._archive.over:
-            self.events.append(f"control {name} came after its point was final: it counts when the strip is over")
+            self.events.append(f"control {name} {came} after its point was final: it counts when the strip is over")
 
     def reweigh_control(self, changes: Iterable[Coordinate]) -> None:
         """Give known coordinates of points that are final other weights."""

@@ -32,7 +32,7 @@ class KeptPoint:
     left, place : the points it left the window with, and its place among them
     strips : where it was seen
     time_s : mean time of its rays in the last of them
-    control : (3,) weights of known coordinates that count in it, 1/m^2
+    control, known_l : (3,), (3,) weights of known coordinates that count in it, 1/m^2, and these coordinates, m
     single : the look, if it is one that found no partner in its strip
     unplaced : it is such a look, and nobody knows yet how far away the ground is
     """
@@ -42,6 +42,7 @@ class KeptPoint:
     strips: frozenset[str]
     time_s: float
     control: Array
+    known_l: Array
     single: SingleLook | None = None
     unplaced: bool = False
 

@@ -196,6 +196,12 @@ class LeftControl(Biases):
         self.coordinates = [c for c, k in zip(self.coordinates, which, strict=True) if k]
         self.out = self.out[which]
 
+    def take_out(self, which: Bools, state: WindowState) -> tuple[IntArray, Information]:
+        """Refuse coordinates (c,) for good, in the state as well; returns what `set_out` returns."""
+        gained = self.set_out(self.out | which, state)
+        self._keep(~which)
+        return gained
+
     def drop_drifts(self) -> None:
         """The strip whose drifts were watched is over: they have no rows here any more."""
         own = self.border.numbers >= 0

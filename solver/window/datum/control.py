@@ -89,6 +89,13 @@ class ControlTests:
         """Unknowns have left the window; those of drifts are among those that stayed."""
         self._left.marginalised(marginal)
 
+    def restated(self, point: str) -> None:
+        """Coordinates of a point are stated anew: those that have left the window count no more."""
+        of_point = np.array([c.point == point for c in self._left.coordinates], dtype=bool)
+        if of_point.any():
+            self.sources.recount(*self._left.take_out(of_point, self._network.state))
+            self._weighed = None
+
     def strip_began(self) -> None:
         """From now on drifts are looked for in another strip."""
         self._left.drop_drifts()

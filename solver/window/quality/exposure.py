@@ -165,6 +165,12 @@ class LeftObservations:
         self.exposed += [replace(e, batch=None) for e in exposed]
         self._bounds.append((time_s, rest))
 
+    def restated(self, point: str) -> None:
+        """Known coordinates of a point that left count no more."""
+        keep = np.array([e.axis < 0 or e.name != point for e in self.exposed], dtype=bool)
+        self.border.keep(np.repeat(keep, 2))
+        self.exposed = [e for e, k in zip(self.exposed, keep, strict=True) if k]
+
     def thin(self, state: WindowState) -> None:
         """Keep the most exposed, and of the others the bound."""
         n, border = len(self.exposed), self.border
@@ -260,6 +266,10 @@ class Integrity:
     def marginalised(self, marginal: Marginal) -> None:
         """Unknowns have left the window."""
         self._left.border.marginalise(marginal)
+
+    def restated(self, point: str) -> None:
+        """Known coordinates of a point are stated anew: no error is in those that left."""
+        self._left.restated(point)
 
     def _most_exposed_of(self, batch: Batch) -> tuple[list[Exposed], float]:
         """The most exposed observations, and the largest lambda of the others."""

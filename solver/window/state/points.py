@@ -40,6 +40,11 @@ class ControlPoint:
             np.isfinite(self.sigma_m), 1.0 / np.where(np.isfinite(self.sigma_m), self.sigma_m, 1.0) ** 2, 0.0
         )
 
+    def says(self, other: ControlPoint) -> bool:
+        """Whether another says the same of the coordinates that count."""
+        weight = self.weight
+        return bool((weight == other.weight).all() and (self.xyz_l == other.xyz_l)[weight > 0].all())
+
 
 @dataclass
 class PointLooks:

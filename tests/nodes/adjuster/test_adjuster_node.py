@@ -327,10 +327,15 @@ def test_control_that_comes_or_changes_in_flight_is_told(done, flight):
     changed = m.GroundPoint()
     changed.CopyFrom(mine[1].body)
     changed.z += 0.5
-    news = [replace(mine[0], stamp_ns=late), Message("observation/control", late, changed)]
+    surer = m.GroundPoint()
+    surer.CopyFrom(mine[2].body)
+    del surer.covariance[:]
+    surer.covariance.extend([1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 2.5e-3])
+    news = [replace(mine[0], stamp_ns=late), *(Message("observation/control", late, b) for b in (changed, surer))]
     said = [text for text, _ in lines(run(Adjuster(grid_hz=2.0, update_s=0.5), rest[:first] + news + rest[first:]))]
     assert f"control came in flight: {mine[0].body.point}" in said
-    assert f"control changed in flight: {changed.point} by 0.00, 0.00, 0.50 m" in said
+    words = f"{surer.point} in its sigmas, from 0.02, 0.02, 0.02 to 0.01, 0.01, 0.05 m"
+    assert f"control changed in flight: {changed.point} by 0.00, 0.00, 0.50 m, {words}" in said
     assert not [text for text, _ in lines(done[1]) if "in flight" in text]
 
 

@@ -199,6 +199,34 @@ def test_control_that_comes_after_its_strip_is_over_counts_as_in_the_batch(fligh
     assert difference < 0.3 and share < 0.02
 
 
+def test_control_that_is_corrected_after_its_point_was_final_leaves_no_trace(flight, online):
+    """All control 0.6 m too high with other sigmas, and a tie point as control; put right in the second strip."""
+    simulation, poses = flight
+    control = np.flatnonzero(simulation.points.role == "control")
+    named = {str(simulation.points.id[i]): simulation.surveyed_l[i] for i in control}
+    passed = next(n for n, p in online.final_points.items() if p.role == "tie")
+    place_l = online.whole_points[passed].xyz_l
+    changed = []
+
+    def watch(now, window):
+        if not changed:
+            for name, xyz_l in named.items():
+                window.add_control(name, xyz_l + np.array([0.0, 0.0, 0.6]), np.full(3, 0.05), "control")
+            window.add_control(passed, place_l + np.array([0.6, 0.0, 0.0]), np.full(3, 0.05), "control")
+            changed.append(now)
+        strip = simulation.flight.strips[1]
+        if len(changed) == 1 and now > strip.first_line_time_s + 20.0:
+            for name, xyz_l in named.items():
+                window.add_control(name, xyz_l, np.full(3, 0.02), "control")
+            window.add_control(passed, place_l, np.full(3, np.inf), "check")
+            changed.append(now)
+
+    result = adjust_online(simulation, poses, OPTIONS, live=False, update_s=0.5, watch=watch)
+    assert any("was changed after its point was final: it counts" in text for text in result.events)
+    difference, share = far_apart(result.whole, online.whole)
+    assert difference < 0.3 and share < 0.02
+
+
 def test_a_strip_that_is_closed_leaves_what_it_says_of_the_others(online):
     archive = deepcopy(online.window._block._archive)
     stay = np.concatenate([archive.strips[id].entered for id in ("S2", "C1")])
