@@ -12,12 +12,16 @@ from numpy.typing import NDArray
 from ...schemas import topics
 from ...schemas.envelope import Envelope
 from ...schemas.topics import Family
+from ...solver.navigation.clock_check import LARGEST_DELAY_S, offset_in_words
 from ..ordering import MAX_JUMP_NS, MILLISECOND_NS, REBASE_AFTER, PlatformTime, StreamCheck, is_orderly
 from .index import Channel
 from .reader import RecordingReader
 
 #: Whose set-back the navigator sees by itself, and says so.
 _WATCHED = "sensor/gnss"
+#: Attitudes or inertial data with a longer step between them, ns, tell no time; so many fixes are enough to say that
+#: their clock is another one.
+_STEADY_NS, _FIXES = 1_000_000_000, 10
 
 
 @dataclass
@@ -85,6 +89,7 @@ def usable(reader: RecordingReader, remade: Callable[[Channel], bool], heard: Ca
     numbers = _of_one_clock(reader, numbers, heard, found)
     if doubtful:
         numbers = _not_set_back(reader, numbers, heard, found)
+    _tell_clocks_apart(reader, numbers, heard, found)
     found.numbers = reader.sort(numbers)
     return found
 
@@ -165,3 +170,30 @@ def _not_set_back(
             found.drop("late", text, int(late.sum()))
             left.append(own[late])
     return np.setdiff1d(numbers, _joined(left))
+
+
+def _tell_clocks_apart(
+    reader: RecordingReader, numbers: NDArray[np.int64], heard: Callable[[str], bool], found: Usable
+) -> None:
+    """Tell that fixes have other stamps than the inertial data or attitudes that were received with them.
+
+    On the bus their nodes see that by themselves; sorted by their stamps they go together, with the positions of other
+    times.
+    """
+    index, channels = reader.index, reader.channels
+
+    def of(topic: str) -> NDArray[np.int64]:
+        ids = [id for id, channel in channels.items() if channel.known and channel.topic == topic and heard(topic)]
+        return numbers[np.isin(index.channel[numbers], ids)]
+
+    fixes = of(_WATCHED)
+    for topic in ("sensor/imu", "sensor/attitude"):
+        own = of(topic)
+        at = np.searchsorted(own, fixes)
+        inside = (at > 0) & (at < len(own))
+        before, after = index.stamp_ns[own[at[inside] - 1]], index.stamp_ns[own[at[inside]]]
+        steady = np.abs(after - before) < _STEADY_NS
+        behind_s = (before - index.stamp_ns[fixes[inside]])[steady] / 1e9
+        if len(behind_s) >= _FIXES and abs(median := float(np.median(behind_s))) > LARGEST_DELAY_S:
+            words = offset_in_words(median, "inertial" if topic == "sensor/imu" else "attitude")
+            found.notes.append(f"{words}, by what was received together")

@@ -114,6 +114,18 @@ def test_messages_out_of_order_are_no_clock_that_was_set_back(tmp_path):
     assert not found.left_out and len(stamps[ATTITUDE]) == 500
 
 
+@pytest.mark.parametrize("ahead_s", [18.0, -18.0, 0.3])
+def test_fixes_with_stamps_of_another_clock_than_attitudes_received_with_them_are_told(tmp_path, ahead_s):
+    gnss = stream(GNSS, 5.0, 30.0, lambda t: t + 100.0 + ahead_s)
+    attitude = stream(ATTITUDE, 100.0, 30.0, lambda t: t + 100.0)
+    silent = [row for row in attitude if not 5.0 < row[0] < 22.0]  # attitudes that stop tell nothing
+    found, stamps = used(recording(tmp_path / "flight.mcap", silent, gnss))
+    assert len(stamps[GNSS]) == 150 and not found.left_out
+    where = {18.0: "ahead of", -18.0: "behind"}.get(ahead_s)
+    told = f"GNSS clock 18.00 s {where} the attitude clock (the leap seconds between GPS time and UTC), by what"
+    assert [note[: len(told)] for note in found.notes] == ([told] if where else [])
+
+
 def test_process_tells_what_it_used_all_the_same_and_counts_only_what_it_left_out(tmp_path, capsys):
     flight, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
     messages = sample.flight(4.0)
