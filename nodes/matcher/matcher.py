@@ -229,6 +229,7 @@ class Matcher(Node):
         another_frame = self._frame_of is not None and not convert.same_frame(body, self._frame_of)
         mounted, self._mounting = self._mounting, convert.mounting_of(body)
         self._frame_of = body
+        self._targets.project(body)
         if np.isfinite(body.origin_height) and body.origin_height != self._origin_m:
             self._origin_m = float(body.origin_height)
             self._set_ground()

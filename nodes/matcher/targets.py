@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from ...schemas import messages as m
 from ...solver.camera.line_camera import LineCamera
 from ...solver.matching.current_orientation import CurrentOrientation
 from ...solver.matching.target_finder import NO_LINES, Target, TargetFinder, TargetLook, TargetOptions
+from ...solver.models.slow_errors import SlowErrors
 from .. import convert
 from ..node import Message
 from .strip_clock import StripClock
@@ -29,6 +31,7 @@ class DoubtfulTargets:
     def __init__(self, options: TargetOptions | None = None) -> None:
         self.options = options or TargetOptions()
         self._finder: TargetFinder | None = None
+        self._slow = SlowErrors()
         self._strip: StripClock | None = None
         self._points: dict[str, Target] = {}
         self._verdict: dict[str, bool] = {}
@@ -37,10 +40,18 @@ class DoubtfulTargets:
     def configure(self, camera: LineCamera, orientation: CurrentOrientation) -> None:
         """Begin (again) with a camera; ``orientation`` is kept up to date by the caller."""
         self._finder = TargetFinder(camera, orientation, self.options)
+        self._finder.slow = self._slow
         self._strip = None
         self._held.clear()
         for target in self._points.values():
             self._finder.set_target(target)
+
+    def project(self, body: Any) -> None:
+        """What a project says of slow errors; without effect where that cannot be, which the adjuster tells."""
+        with suppress(ValueError):
+            self._slow = convert.slow_errors_of(body)
+        if self._finder is not None:
+            self._finder.slow = self._slow
 
     def forget(self) -> None:
         """Forget all targets, whose coordinates are in a local frame that was given up; verdicts on them stay."""

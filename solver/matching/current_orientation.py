@@ -101,6 +101,10 @@ class CurrentOrientation:
         for old in [k for k in self._knots if k < knot - KEPT_S / KNOT_S]:
             del self._knots[old], self._covariance[old]
 
+    def beyond_s(self, time_s: float) -> float:
+        """So long after the newest correction a time is, s; 0 without corrections."""
+        return 0.0 if self._newest is None else max(time_s - self._newest[0], 0.0)
+
     def forget_corrections(self) -> None:
         """A new strip begins: corrections of the last one say little about it."""
         self._knots.clear()

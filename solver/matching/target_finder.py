@@ -17,6 +17,7 @@ from scipy.ndimage import map_coordinates
 
 from ..camera.line_camera import LineCamera
 from ..geometry.rotation import angles_from_matrix, matrix_from_angles
+from ..models.slow_errors import SlowErrors
 from ..ranges import check_ranges
 from .current_orientation import CurrentOrientation
 from .line_scan import LineScan, view_of
@@ -132,11 +133,12 @@ class TargetFinder:
     Attributes
     ----------
     counters : looks by what became of them
+    slow : by what the orientation wanders between corrections, kept up to date as ``orientation`` is
     """
 
     def __init__(self, camera: LineCamera, orientation: CurrentOrientation, options: TargetOptions | None = None):
         self.options = options or TargetOptions()
-        self.orientation = orientation
+        self.orientation, self.slow = orientation, SlowErrors()
         self.views = {line.id: view_of(camera, i) for i, line in enumerate(camera.lines)}
         self.counters: Counter[str] = Counter()
         self._targets: dict[str, Target] = {}
@@ -275,7 +277,8 @@ class TargetFinder:
         xyz, slope = moved.to_plane(np.arange(7.0), np.full(7, sample), np.full(7, target.xyz_l[2]))
         by_pose = ((xyz[1:, :2] - xyz[0, :2]) / np.array(STEPS)[:, None]).T
         by_point = np.column_stack([-np.eye(2), slope[0]])
-        pose = self.orientation.covariance(self._time_of(line))
+        time_s = self._time_of(line)
+        pose = self.orientation.covariance(time_s) + np.diag(self.slow.wandered(self.orientation.beyond_s(time_s)))
         return by_pose @ pose @ by_pose.T + by_point @ target.covariance @ by_point.T
 
     def _shaken(self, scan: LineScan, line: float, height_m: float) -> Array:

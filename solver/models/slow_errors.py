@@ -81,6 +81,11 @@ class SlowErrors:
         """With one correlation time, the shorter one: for models that have no other."""
         return replace(self, wander_time_s=float(self.wander_times_s.min()), attitude_time_s=0.0)
 
+    def wandered(self, seconds: float) -> Array:
+        """(6,) variance by which the wander moves away from where it was so long before."""
+        sigma = np.concatenate([self.wander_m, self.wander])
+        return 2.0 * sigma**2 * -np.expm1(-seconds / self.wander_times_s)
+
     @property
     def attitude_sigma(self) -> Array:
         """(3,) of omega, phi, kappa together; of the drift all, since a filter knows nothing of strips."""

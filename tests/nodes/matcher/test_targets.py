@@ -15,6 +15,7 @@ from triline.solver.matching.current_orientation import CurrentOrientation
 from triline.solver.matching.line_times import LineTimes
 from triline.solver.matching.target_finder import Target, TargetFinder, TargetOptions
 from triline.solver.matching.target_image import RING, candidates, fit, pattern
+from triline.solver.models.slow_errors import SlowErrors
 from triline.solver.simulation.observations import find_looks
 
 FLIGHT = {
@@ -47,8 +48,13 @@ def signalised(flown):
     return [str(points.id[i]) for i in chosen], points.xyz_l[chosen]
 
 
-def looks_at(flown, images, names, places, *, seed=1, position_m=1.0, attitude_deg=0.02, options=None, lost=None):
-    """What a finder sees when the orientation is wrong by errors of the size that its covariance tells."""
+def looks_at(
+    flown, images, names, places, *, seed=1, position_m=1.0, attitude_deg=0.02, options=None, lost=None, wandered=None
+):
+    """What a finder sees when the orientation is wrong by errors of the size that its covariance tells.
+
+    ``wandered``: slow errors; positions then wander by three sigma in 10 s, after the one correction there is.
+    """
     flight = flown.simulation.flight
     strip, camera = flight.strips[0], flight.camera
     rng = np.random.default_rng(seed)
@@ -57,10 +63,16 @@ def looks_at(flown, images, names, places, *, seed=1, position_m=1.0, attitude_d
     sigma = np.concatenate([np.full(3, position_m), np.full(3, np.radians(attitude_deg))])
     off = sigma * rng.standard_normal(6)
     position = truth.position_l + off[:3]
+    if wandered is not None:
+        speed_m_s = 0.3 * np.sqrt(wandered.wandered(10.0)[0])
+        position[:, 1] += speed_m_s * np.maximum(time_s - strip.first_line_time_s, 0.0)
     angles = truth.angles + off[3:] + np.radians(0.0005) * rng.standard_normal((len(time_s), 3))
     quaternion = quaternion_from_matrix(matrix_from_angles(*angles.T))
     orientation = CurrentOrientation()
     finder = TargetFinder(camera, orientation, options)
+    if wandered is not None:
+        finder.slow = wandered
+        orientation.add_correction(strip.first_line_time_s, np.zeros(6), np.diag(sigma**2))
     radius = flown.imager.texture.target_radius_m
     for name, place in zip(names, places, strict=True):
         finder.set_target(Target(name, place, COORDINATE_SIGMA_M**2 * np.eye(3), radius))
@@ -220,6 +232,14 @@ def test_a_finder_wants_sensible_options():
 
 
 # ---- messages
+
+
+def test_targets_are_where_the_orientation_has_wandered_since_it_was_corrected(flown, images):
+    """As where corrections come every 10 s, in `process` at the pace for throughput."""
+    slow = SlowErrors(wander_m=(1.0, 1.0, 1.0), wander_time_s=30.0)
+    small = {"position_m": 0.05, "attitude_deg": 0.0005, "wandered": slow}
+    looks = [x for x in looks_at(flown, images, *signalised(flown), **small) if x.found]
+    assert len(looks) > 20 and not [x for x in looks if x.reason == "far from where it should be"]
 
 
 @pytest.fixture(scope="module")
