@@ -131,7 +131,9 @@ class Block:
         came = "was changed" if self.knows(name) else "came"
         if not self._archive.add_control(name, control):
             return
-        if self.earlier.add_control(name, control):
+        if not control.weight.any():
+            self.events.append(f"control {name} was taken back after its point was final: what is whole is without it")
+        elif self.earlier.add_control(name, control):
             self.events.append(f"control {name} {came} after its point was final: it counts from now on")
         elif self._new or self._archive.over:
             self.events.append(f"control {name} {came} after its point was final: it counts when the strip is over")
