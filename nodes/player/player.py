@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ SECOND_NS = 1_000_000_000
 SETTINGS: dict[str, float | bool | None] = {"rate": 1.0, "from": None, "to": None, "loop": False, "all": False}
 #: Between the end of a recording and its next round, platform time.
 LOOP_PAUSE_NS = SECOND_NS
+STRIP = "configuration/strip"
 #: Tells a message from all others: topic, source, start and sequence.
 _Key = tuple[str, str, int, int]
 
@@ -93,7 +95,8 @@ def play(
     from_ns, to_ns : platform time to play, ends included; of what was said before, what holds then is played always:
         configuration, control, and an operator's verdicts; and a project or camera that waited for a verdict of the
         part comes with it
-    loop : again and again; stamps, times inside messages are shifted in later rounds, strips and points get new names
+    loop : again and again; stamps, times inside messages are shifted in later rounds, strips and points get new names;
+        a strip whose end is not played ends with the round
     everything : also what nodes make anew
     start : tells this run from others in the envelopes
     settle_s : waiting time after configuration and control, s
@@ -117,12 +120,13 @@ def play(
         raise UserError(f"{reader.path}: nothing to play")
     if not len(body) and (loop or from_ns is not None or to_ns is not None):
         raise UserError(f"{reader.path}: nothing but configuration in the time asked for")
-    stamps = reader.index.stamp_ns[body]
-    span_ns = int(stamps.max() - stamps.min()) + LOOP_PAUSE_NS if len(body) else 0
+    stamps, channel_of = reader.index.stamp_ns[body], reader.index.channel
+    strips = _Strips(head, [reader.raw(int(n)) for n in body if reader.channels[int(channel_of[n])].topic == STRIP])
+    span_ns = int(stamps.max()) - min(int(stamps.min()), strips.begin_ns) + LOOP_PAUSE_NS if len(body) else 0
     starts = _Starts(start)
     while not stop.is_set():
         shift_ns = result.rounds * span_ns
-        for raw in head:
+        for raw in strips.without_over(head) if result.rounds else head:
             _publish(raw, publish, starts, shift_ns, result)
         stop.wait(settle_s if result.rounds == 0 else 0.0)
         times = reader.index.receive_ns[body]
@@ -136,6 +140,8 @@ def play(
                 _publish(raw, publish, starts, shift_ns, result)
             if progress is not None and i % 256 == 0:
                 progress(i / len(body))
+        for raw in strips.ends(int(stamps.max())) if loop and len(body) and not stop.is_set() else ():
+            _publish(raw, publish, starts, shift_ns, result)
         result.rounds += 1
         result.worst_late_s = max(result.worst_late_s, pacer.worst_late_s)
         result.mean_late_s = pacer.mean_late_s
@@ -143,6 +149,51 @@ def play(
             break
         stop.wait(LOOP_PAUSE_NS / SECOND_NS / (rate or 1.0))
     return result
+
+
+class _Strips:
+    """Strips of a part of a flight that is played again and again: a round flies none of another one.
+
+    Parameters
+    ----------
+    before, inside : messages, those of strips among them, that are sent at once and that come in the part
+
+    Attributes
+    ----------
+    begin_ns : when the first one begins that is flown when the part does
+    """
+
+    def __init__(self, before: Sequence[RawMessage], inside: Sequence[RawMessage]) -> None:
+        told = self._by_name(before)
+        self._over = {id for id, (_, body) in told.items() if body.ended}
+        self.begin_ns = min((body.first_line_time_ns for _, body in told.values() if not body.ended), default=2**62)
+        self._unended = [raw for raw, body in (told | self._by_name(inside)).values() if not body.ended]
+
+    @staticmethod
+    def _by_name(messages: Sequence[RawMessage]) -> dict[str, tuple[RawMessage, Any]]:
+        """Strips as they were told last; what cannot be decoded tells none."""
+        strips = {}
+        for raw in messages:
+            with suppress(ValueError):
+                if raw.topic == STRIP:
+                    body = codec.decode(raw.topic, raw.data)
+                    strips[body.id] = raw, body
+        return strips
+
+    def without_over(self, before: Sequence[RawMessage]) -> list[RawMessage]:
+        """What is sent at once, without strips that are over when the part begins."""
+        return [raw for raw in before if self._over.isdisjoint(self._by_name([raw]))]
+
+    def ends(self, at_ns: int) -> list[RawMessage]:
+        """Messages by which strips end at a time whose end does not come."""
+        messages = []
+        for raw, body in self._by_name(self._unended).values():
+            body.ended = True
+            lines = max(int((at_ns - body.first_line_time_ns) / SECOND_NS * body.line_rate_hz), 1)
+            body.lines = min(body.lines or lines, lines)
+            envelope = raw.envelope._replace(stamp_ns=at_ns, sequence=raw.envelope.sequence + 1)
+            messages.append(raw._replace(envelope=envelope, data=codec.encode(body)))
+        return messages
 
 
 def _split(reader: RecordingReader, numbers: Any, from_ns: int | None, to_ns: int | None) -> tuple[Any, Any]:

@@ -99,3 +99,32 @@ def test_of_what_waits_for_a_verdict_the_last_counts(tmp_path):
         )
         found = [row for row in part if row[0] >= begin_ns and row[1] == "configuration/camera"]
         assert found == [row for row in whole if row[0] >= begin_ns], begin_s
+
+
+def test_a_part_that_is_played_again_and_again_ends_its_strips_and_flies_no_two_at_once(tmp_path):
+    """A round of 3 s in mid-strip: the next one begins when the strip of the one before is over."""
+    path, stop, played = tmp_path / "flight.mcap", threading.Event(), []
+    strips = [("S1", 1, False, 1), ("S1", 1, True, 3), ("S2", 4, False, 4), ("S2", 4, True, 12)]
+    rows = [
+        (t, "configuration/strip", m.Strip(id=id, first_line_time_ns=EPOCH_NS + first * SECOND_NS, line_rate_hz=100.0,
+                                           lines=100 * (t - first) if ended else 0, ended=ended))
+        for id, first, ended, t in strips
+    ]  # fmt: skip
+    rows += [(t, "sensor/gnss", sample.body("sensor/gnss"), "a") for t in range(15)]
+    with RecordingWriter(path) as writer:
+        for t, topic, body, *_ in sorted(rows, key=lambda row: row[0]):
+            writer.write(Message(topic, EPOCH_NS + t * SECOND_NS, body, "a"))
+
+    def publish(raw):
+        played.append(raw)
+        if sum(one.topic == "sensor/gnss" for one in played) == 8:
+            stop.set()
+
+    part = {"from_ns": EPOCH_NS + 6 * SECOND_NS, "to_ns": EPOCH_NS + 9 * SECOND_NS}
+    play(RecordingReader(path), publish, stop, rate=0.0, **part, settle_s=0.0, loop=True)
+    told = [codec.decode(raw.topic, raw.data) for raw in played if raw.topic == "configuration/strip"]
+    first_s = [(body.id, (body.first_line_time_ns - EPOCH_NS) / SECOND_NS, body.lines, body.ended) for body in told]
+    assert first_s[2:] == [("S2", 4.0, 0, False), ("S2", 4.0, 500, True), ("S2~2", 10.0, 0, False)]
+    assert [(raw.envelope.stamp_ns - EPOCH_NS) / SECOND_NS for raw in played if raw.topic == "sensor/gnss"] == [
+        6, 7, 8, 9, 12, 13, 14, 15,
+    ]  # fmt: skip
