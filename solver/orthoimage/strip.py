@@ -232,10 +232,13 @@ class StripRectifier:
 
     def _begin(self, least: int = 8) -> list[Patch]:
         """Lay the axes through the lines at hand."""
-        known = np.flatnonzero(np.isfinite(self._cells).all(axis=(1, 2)))
-        if len(known) < least:
+        met = np.isfinite(self._cells).all(axis=2)
+        count = met.sum(axis=0)
+        rays = np.flatnonzero(2 * count >= max(int(count.max(initial=0)), 1))  # the ground may end under the others
+        known = np.flatnonzero(met[:, rays].all(axis=1))
+        if len(known) < least or len(rays) < 2:
             return []
-        self._axes = _Axes.through(self._cells[known], known, self.rays.sample)
+        self._axes = _Axes.through(self._cells[np.ix_(known, rays)], known, self.rays.sample[rays])
         self._place = self._axes.place(self._cells)
         self._done = int(np.floor(np.nanmin(self._place[..., 0])))
         return self._rectify(self.band)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -17,8 +18,10 @@ Mask = NDArray[np.bool_]
 
 #: The relief correction ends when heights move less than this, m, or after so many rounds.
 TOLERANCE_M, ROUNDS = 1e-3, 12
-#: Steps a cell of the search along a ray that the relief correction could not follow, and the most of them.
+#: Steps a cell of the search along rays that the relief may be as steep as, and the most of them.
 STEPS_A_CELL, MOST_STEPS = 2.0, 4096
+#: Cells a side of the squares whose highest and steepest ground tells which rays are searched. Tuned.
+SQUARE_CELLS = 32
 #: Rounds of a bent ray with the ground. Derived: the shift changes by 1e-4 of a change in height, which is itself the
 #: shift times the slope of the ground, so the second round leaves less than a millimetre.
 _AIR_ROUNDS = 2
@@ -169,8 +172,9 @@ class HeightField:
     def meet(self, position_l: Array, direction_l: Array) -> tuple[Array, Mask]:
         """See `Surface.meet`.
 
-        The relief correction goes from height to height along the ray, by the secant through the last two. Rays that
-        it does not bring to rest (relief about as steep as the ray) are searched from above, step by step.
+        The relief correction goes from height to height along the ray, by the secant through the last two. Where the
+        relief around is as steep as the ray, and where it is not brought to rest, the ray is searched from above, step
+        by step: it may have met the ground before.
         """
         shape = np.broadcast_shapes(position_l.shape, direction_l.shape)
         origin = np.broadcast_to(position_l, shape).reshape(-1, 3)
@@ -178,12 +182,51 @@ class HeightField:
         down = d[:, 2] < 0
         slope = d[:, :2] / np.where(down, d[:, 2], np.nan)[:, None]
         z = self._correct(origin, slope)
-        lost = np.flatnonzero(~np.isfinite(z) & down)
-        if len(lost):
-            z[lost] = self._search(origin[lost], slope[lost])
+        z[z > origin[:, 2]] = np.nan  # behind the sensor
+        end = np.where(np.isfinite(z), z, float(np.nanmin(self.z_m)) - 1e-6)
+        top, steepest = self._around(origin, slope, end)
+        begin = np.minimum(top, origin[:, 2])
+        steep = (np.linalg.norm(slope, axis=1) * steepest >= 1.0) & (begin > end)
+        search = np.flatnonzero(down & (steep | np.isnan(z)))
+        if len(search):
+            met = self._search(origin[search], slope[search], begin[search], end[search])
+            z[search] = np.where(np.isfinite(met), met, z[search])
         xy = origin[:, :2] + slope * (z - origin[:, 2])[:, None]
         point = np.column_stack([xy, z])
         return point.reshape(shape), np.isfinite(z).reshape(shape[:-1])
+
+    @cached_property
+    def _squares(self) -> Array:
+        """Highest ground (m) and its steepest slope (metres a metre) of squares of cells, (2, k, m)."""
+        rows, columns = self.z_m.shape
+        starts = np.arange(0, columns, SQUARE_CELLS)
+        out = []
+        for i in range(0, rows, SQUARE_CELLS):  # a few rows at a time: rasters may be large
+            z = self.z_m[i : i + SQUARE_CELLS + 1]
+            n = min(SQUARE_CELLS, rows - i)
+            steps = [np.abs(np.diff(z, axis=axis, append=np.nan))[:n] / self.step_m for axis in (0, 1)]
+            steepest = np.hypot(*[np.where(np.isfinite(a), a, 0.0) for a in steps])
+            high = np.where(np.isfinite(z[:n]), z[:n], -np.inf)
+            out.append([np.maximum.reduceat(a.max(axis=0), starts) for a in (high, steepest)])
+        return np.stack(out, axis=1)
+
+    def _around(self, origin: Array, slope: Array, end: Array) -> tuple[float, float]:
+        """Height of the highest ground (m) and slope of the steepest (metres a metre) in the squares that rays pass
+        between the highest ground of all and their ends."""
+        high, steep = self._squares
+        top = float(high.max())
+        ends = [origin[:, :2] + slope * (z - origin[:, 2])[:, None] for z in (end, np.minimum(top, origin[:, 2]))]
+        xy = np.concatenate(ends)
+        if not np.isfinite(xy).any():
+            return top, 0.0
+        side = SQUARE_CELLS * self.step_m
+        part = []
+        for low, at, n in ((self.y_m, xy[:, 1], high.shape[0]), (self.x_m, xy[:, 0], high.shape[1])):
+            # slopes of a square reach into the next one
+            first, last = ((float(f(at)) - low) / side for f in (np.nanmin, np.nanmax))
+            part.append(slice(int(np.clip(first - 1, 0, n - 1)), int(np.clip(last + 1, 0, n - 1)) + 1))
+        high, steep = high[tuple(part)], steep[tuple(part)]
+        return float(high.max()) + 1e-6, float(steep.max())
 
     def _above(self, origin: Array, slope: Array, z: Array) -> Array:
         """How far the ground lies above height z on each ray, m."""
@@ -207,19 +250,20 @@ class HeightField:
             z0, f0, z1 = z1, f1, z1 + change
         return np.where(np.abs(self._above(origin, slope, z1)) <= TOLERANCE_M, z1, np.nan)
 
-    def _search(self, origin: Array, slope: Array) -> Array:
-        """Heights (n,) of the first crossing of each ray from above, NaN where there is none."""
-        top, bottom = float(np.nanmax(self.z_m)) + 1e-6, float(np.nanmin(self.z_m)) - 1e-6
-        way = float(np.nanmax(np.linalg.norm(slope, axis=1), initial=0.0)) * (top - bottom)
+    def _search(self, origin: Array, slope: Array, begin: Array, end: Array) -> Array:
+        """Heights (n,) of the first crossing of each ray between two heights (n,), NaN where there is none."""
+        way = float(np.nanmax(np.linalg.norm(slope, axis=1) * (begin - end), initial=0.0))
         steps = int(np.clip(np.ceil(STEPS_A_CELL * way / self.step_m), 8, MOST_STEPS))
-        high = np.full(len(origin), top)
-        low = np.full(len(origin), np.nan)
-        before = high
-        for z in np.linspace(top, bottom, steps + 1):
-            here = np.full(len(origin), z)
-            crossed = np.isnan(low) & (self._above(origin, slope, here) >= 0)
-            low[crossed], high[crossed] = z, before[crossed]
-            before = here
+        high, low = begin.copy(), np.full(len(origin), np.nan)
+        left = np.arange(len(origin))
+        for share in np.linspace(0.0, 1.0, steps + 1):
+            z = begin[left] + share * (end[left] - begin[left])
+            crossed = self._above(origin[left], slope[left], z) >= 0
+            low[left[crossed]] = z[crossed]
+            left = left[~crossed]
+            high[left] = z[~crossed]
+            if not len(left):
+                break
         for _ in range(40):
             middle = 0.5 * (low + high)
             under = self._above(origin, slope, middle) >= 0

@@ -143,6 +143,30 @@ def test_relief_steeper_than_the_rays_is_met_where_it_is_first_seen():
         assert abs(z[np.argmax(under)] - found[2]) < 0.1
 
 
+def test_rays_stop_at_the_first_roof_or_wall():
+    """The relief correction alone comes to rest on the ground behind a building as well."""
+    rng = np.random.default_rng(4)
+    z = np.full((300, 300), 100.0)
+    for i, j, rows, columns in np.column_stack([rng.integers(5, 270, (40, 2)), rng.integers(6, 25, (40, 2))]):
+        z[i : i + rows, j : j + columns] = rng.uniform(105, 140)
+    field = HeightField(0.0, 0.0, 1.0, z)
+    foot = np.column_stack([rng.uniform(60, 240, (3000, 2)), np.full(3000, 100.0)])
+    direction = np.column_stack([rng.uniform(-0.8, 0.8, (3000, 2)), -np.ones(3000)])
+    position = foot - 500.0 * direction
+    high = np.linspace(141.0, 99.99, 4000)
+    first = np.full(3000, np.nan)
+    for k in range(3000):
+        q = position[k] + direction[k] * (position[k, 2] - high)[:, None]
+        first[k] = high[np.argmax(field.height(q[:, 0], q[:, 1]) >= high)]
+    point, met = field.meet(position, direction)
+    assert met.all()
+    # a ray may pass an edge by less than a step of the search
+    assert (np.abs(point[:, 2] - first) > 0.1).mean() < 0.003
+    below = np.array([[150.0, 150.0, 120.0]])  # of a mountain above the sensor nothing is seen behind it
+    hill = HeightField(0.0, 0.0, 1.0, np.linspace(0.0, 400.0, 300)[None, :] + np.zeros((300, 1)))
+    assert not hill.meet(below, np.array([[-0.2, 0.0, -1.0]]))[1].any()
+
+
 def test_heights_unknown_or_outside():
     z = np.zeros((5, 5))
     z[2, 2] = np.nan
@@ -383,6 +407,26 @@ def test_lines_that_see_no_ground_are_counted():
     image = np.ones((100, PIXELS), dtype=np.uint8)
     assert strip.add(0, image, None, flight.position(lines), flight.R(lines)) == [] and strip.finish() == []
     assert strip.missed == 100 * len(rays_of(CAMERA, 1).sample)
+
+
+@pytest.mark.parametrize("oblique", [0.0, 0.5])
+def test_ground_that_ends_under_a_strip_is_rectified_as_far_as_it_goes(oblique):
+    """Its edge runs along the strip, or across it so that no line has all of it."""
+    flight, grid = _Flight(heading=0.0), GroundGrid(replace(FRAME, crs="local"), 2.0)
+    x, y = np.meshgrid(np.arange(-900.0, 901.0, 5.0), np.arange(-900.0, 901.0, 5.0))
+    field = HeightField(-900.0, -900.0, 5.0, np.where(y > 100.0 + oblique * x, np.nan, 0.0))
+    strip = StripRectifier(rays_of(CAMERA, 1), field, grid)
+    lines = np.arange(300)
+    image = np.full((300, PIXELS), 7, dtype=np.uint8)
+    seen = _mosaic([p for part in np.split(lines, 3) for p in strip.add(
+        part[0], image[part], None, flight.position(part), flight.R(part))] + strip.finish())  # fmt: skip
+    row0, row1, column0, column1 = seen.extent()
+    filled = seen.read(row0, row1, column0, column1) > 0
+    rows, columns = np.nonzero(filled)
+    east, north = grid.centre(columns + column0, rows + row0)
+    assert np.ptp(east) > 300.0 and north.min() < -250.0
+    edge = 100.0 + oblique * east
+    assert (north < edge + 1.0).all() and (edge - north).min() < 45.0
 
 
 @pytest.mark.parametrize(("method", "order"), [("nearest", 0), ("bilinear", 1)])
