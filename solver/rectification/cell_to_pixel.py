@@ -1,8 +1,8 @@
 """From the cells of a tile to the pixels of an image, by any location model (indirect rectification).
 
-Line and sample are smooth in column, row and height. The model is asked at nodes of the tile and at three heights; the
-polynomial through them is held against the model between the nodes, and has more nodes until it agrees, or the tile is
-quartered. So only the nodes pay for orbit, attitude and refraction, and the relief acts on every cell.
+Line and sample are smooth in column, row and height. The model is asked at nodes of the tile and at some heights; the
+polynomial through them is held against the model between the nodes, and has more of both until it agrees, or the tile
+is quartered. So only the nodes pay for orbit, attitude and refraction, and the relief acts on every cell.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ TOLERANCE_PX = 0.005
 #: Largest difference of places in the raster of heights, its cells. Derived: a hundredth of a cell of 30 m moves the
 #: height by less than the heights are good for, even on a slope of 45 degrees.
 TOLERANCE_HEIGHT_CELLS = 0.01
-#: Nodes a side that are tried; beyond the last the tile is quartered.
-NODES = (3, 5, 9)
+#: Nodes a side and heights that are tried; beyond the last the tile is quartered. Of a satellite three heights do; over
+#: relief of a third of the flying height seven.
+NODES = ((3, 3), (5, 3), (5, 5), (9, 5), (9, 7))
 #: A tile of fewer cells a side is not quartered any more: each of its cells is asked.
 SMALLEST_TILE = 24
 #: Pixels around the image, beside its own size, for which the model is asked, so that tiles at the edge have all nodes.
@@ -191,16 +192,15 @@ def pixels_of_tile(
     ------
     tile, pixels : the parts of the tile that may see the image
     """
-    heights: HeightsOfTile | None = None
+    height: Float32 | float
     if isinstance(terrain, float | int):
-        low = high = float(terrain)
+        height = float(terrain)
     else:
         heights = ellipsoidal or heights_of_tile(tile, where, terrain)
         if heights is None:
             return
-        low, high = float(np.nanmin(heights.height_m)), float(np.nanmax(heights.height_m))
-    height = None if heights is None else heights.height_m
-    yield from _part(_Work(model, where, tolerance_px, tile, height, _levels(low, high), footprint), tile)
+        height = heights.height_m
+    yield from _part(_Work(model, where, tolerance_px, tile, height, footprint), tile)
 
 
 @dataclass(frozen=True)
@@ -211,8 +211,7 @@ class _Work:
     where: CellPlaces
     tolerance: float
     whole: Tile
-    height: Float32 | None
-    levels: Array
+    height: Float32 | float
     footprint: Array | None
 
     @property
@@ -233,11 +232,29 @@ class _Work:
         )
         return pixel.reshape(len(levels), *column.shape, 2)
 
+    def height_of(self, tile: Tile) -> Float32 | None:
+        """Heights of the cells of a part, None where it is the same everywhere."""
+        if isinstance(self.height, float):
+            return None
+        row, column = tile.row - self.whole.row, tile.column - self.whole.column
+        return self.height[row : row + tile.rows, column : column + tile.columns]
+
+    def range_of(self, height: Float32 | None) -> tuple[float, float]:
+        """Lowest and highest height of a part; of the whole tile where the part has none."""
+        if isinstance(self.height, float):
+            return self.height, self.height
+        some = height if height is not None and np.isfinite(height).any() else self.height
+        return float(np.nanmin(some)), float(np.nanmax(some))
+
 
 def _part(work: _Work, tile: Tile) -> Iterator[tuple[Tile, Pixels]]:
-    found = None
-    for count in NODES:
-        values = work.ask(*node_grid(tile, count), work.levels)
+    h = work.height_of(tile)
+    low, high = work.range_of(h)
+    found, levels = None, np.array([low])
+    level = high - low < 1e-3
+    for count, heights in dict.fromkeys((count, 1) for count, _ in NODES) if level else NODES:
+        levels = _levels(low, high, heights)
+        values = work.ask(*node_grid(tile, count), levels)
         missed = np.isnan(values).any(axis=-1)
         if missed.all() and not _touches(work.footprint, tile):
             return
@@ -245,20 +262,16 @@ def _part(work: _Work, tile: Tile) -> Iterator[tuple[Tile, Pixels]]:
             break
         if not _may_see(work.model, values):
             return
-        if _agrees(work, tile, values):
+        if _agrees(work, tile, values, levels):
             found = values
             break
-    h = None
-    if work.height is not None:
-        row, column = tile.row - work.whole.row, tile.column - work.whole.column
-        h = work.height[row : row + tile.rows, column : column + tile.columns]
     if found is not None:
-        yield tile, _dense(tile, found, work.levels, h)
+        yield tile, _dense(tile, found, levels, h)
     elif max(tile.rows, tile.columns) > SMALLEST_TILE:
         for quarter in tile.quarters():
             yield from _part(work, quarter)
     else:
-        yield tile, _every(work, tile, h)
+        yield tile, _every(work, tile, low, h)
 
 
 def _touches(footprint: Array | None, tile: Tile) -> bool:
@@ -278,33 +291,30 @@ def _may_see(model: Inverse, values: Array) -> bool:
     return bool((high + room >= -0.5).all() and (low - room <= np.array([model.lines, model.samples]) - 0.5).all())
 
 
-def _levels(low: float, high: float) -> Array:
-    """Heights that the model is asked at: one on flat ground, else three."""
-    return np.array([low]) if high - low < 1e-3 else np.array([low, 0.5 * (low + high), high])
+def _levels(low: float, high: float, count: int) -> Array:
+    """Heights, ``count`` of them, that the model is asked at."""
+    return np.array([low]) if count == 1 else low + (high - low) / (count - 1) * places(count, count)
 
 
-def _agrees(work: _Work, tile: Tile, values: Array) -> bool:
+def _agrees(work: _Work, tile: Tile, values: Array, levels: Array) -> bool:
     """Whether the polynomial gives what the model gives between the nodes, and between the heights."""
     (rows, columns), A, B = _between(tile, values.shape[1:3])
     column, row = np.meshgrid(columns, rows)
-    levels = work.levels
-    between = levels if len(levels) == 1 else np.array([0.75 * levels[0] + 0.25 * levels[2]])
+    middle = len(levels) // 2
+    between = levels if len(levels) == 1 else 0.5 * levels[middle - 1 : middle] + 0.5 * levels[middle]
     true = work.ask(column, row, between)[0]
     if np.isnan(true).any():
         return False
-    at = values[0] if len(levels) == 1 else _at_height(values, -0.5)
+    at = np.einsum("i,ijkc->jkc", lagrange(levels, between)[0], values)
     got = np.einsum("ij,jkc,lk->ilc", A, at, B)
     return not np.abs(got - true).max() > work.tolerance
 
 
-def _at_height(values: Array, t: float) -> Array:
-    """Values (k, m, 2) at a height, as a share ``t`` from -1 (lowest) to 1, of those (3, k, m, 2) at three heights."""
-    middle, first, second = _taylor(values)
-    return middle + t * (first + t * second)
-
-
-def _taylor(values: Array) -> tuple[Array, Array, Array]:
-    return values[1], 0.5 * (values[2] - values[0]), 0.5 * (values[2] + values[0]) - values[1]
+def _taylor(values: Array) -> Array:
+    """Coefficients (n, k, m) of a polynomial in the height, from -1 (lowest) to 1, of values at n heights."""
+    n = len(values)
+    share = 2.0 / (n - 1) * places(n, n) - 1.0
+    return np.einsum("ij,jkm->ikm", np.linalg.inv(np.vander(share, increasing=True)), values)
 
 
 def _dense(tile: Tile, values: Array, levels: Array, height: Float32 | None) -> Pixels:
@@ -313,15 +323,18 @@ def _dense(tile: Tile, values: Array, levels: Array, height: Float32 | None) -> 
     origin = np.floor(base.reshape(-1, 2).mean(axis=0))
     coordinates = []
     t = None
-    if height is not None and len(levels) == 3:
-        t = (height - np.float32(levels[1])) * np.float32(2.0 / (levels[2] - levels[0]))
+    if height is not None and len(levels) > 1:
+        low, high = levels[0], levels[-1]
+        t = (height - np.float32(0.5 * (low + high))) * np.float32(2.0 / (high - low))
     for k in range(2):
         out = over_tile(base[..., k] - origin[k], tile.rows, tile.columns)
         if t is not None:
-            _, first, second = _taylor(values[..., k])
-            slope = _flat_or_dense(first, tile)
-            if np.abs(second).max() > 0.1 * TOLERANCE_PX:
-                slope = slope + t * _flat_or_dense(second, tile)
+            terms = list(_taylor(values[..., k])[1:])
+            while len(terms) > 1 and np.abs(terms[-1]).max() < 0.1 * TOLERANCE_PX:
+                terms.pop()
+            slope = _flat_or_dense(terms.pop(), tile)
+            while terms:
+                slope = _flat_or_dense(terms.pop(), tile) + t * slope
             out += slope * t
         elif height is not None:
             out += np.where(np.isfinite(height), np.float32(0.0), np.float32(np.nan))
@@ -337,11 +350,11 @@ def _flat_or_dense(values: Array, tile: Tile) -> Float32:
     return over_tile(values, tile.rows, tile.columns)
 
 
-def _every(work: _Work, tile: Tile, height: Float32 | None) -> Pixels:
+def _every(work: _Work, tile: Tile, level: float, height: Float32 | None) -> Pixels:
     """Every cell asked, at the edge of what the model covers."""
     row, column = np.mgrid[tile.row : tile.row + tile.rows, tile.column : tile.column + tile.columns].astype(float)
     lat, lon = work.where(column.ravel(), row.ravel())
-    h = np.full(len(lat), work.levels[0]) if height is None else height.ravel().astype(float)
+    h = np.full(len(lat), level) if height is None else height.ravel().astype(float)
     pixel = np.full((len(lat), 2), np.nan)
     known = np.isfinite(h)
     if known.any():

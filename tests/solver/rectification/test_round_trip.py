@@ -13,7 +13,7 @@ from triline.solver.geometry.frames import LocalFrame
 from triline.solver.geometry.rotation import matrix_from_angles
 from triline.solver.location.frame_camera import FrameCamera
 from triline.solver.location.refraction import Refraction
-from triline.solver.rectification.cell_to_pixel import Tile, pixels_of_tile
+from triline.solver.rectification.cell_to_pixel import HeightsOfTile, Tile, pixels_of_tile
 from triline.solver.rectification.grid import MapGrid, default_crs
 from triline.solver.rectification.occlusion import ground_slopes
 from triline.solver.rectification.pixel_to_cell import meet_terrain, mesh_cells
@@ -161,6 +161,37 @@ def test_cells_see_the_pixels_that_the_model_says_and_both_ways_agree(pushbroom,
     apart = np.maximum(np.abs(mesh.line - whole[0]), np.abs(mesh.sample - whole[1]))
     assert apart.max() < 0.05
     assert np.percentile(apart, 90) < 0.002
+
+
+class Counted:
+    """A model that counts how often it is asked."""
+
+    def __init__(self, model):
+        self.model, self.lines, self.samples, self.asked = model, model.lines, model.samples, 0
+
+    def inverse(self, lat, lon, height_m, margin_px):
+        self.asked += len(np.ravel(lat))
+        return self.model.inverse(lat, lon, height_m, margin_px)
+
+
+@pytest.mark.parametrize("relief_m", [50.0, 400.0])
+def test_relief_of_a_third_of_the_flying_height_asks_the_model_at_few_places(relief_m):
+    """Pixels are no parabola of the height there; every cell was asked for its own."""
+    frame = LocalFrame(39.0, 32.0, 0.0, "EPSG:32636")
+    east, north, _ = frame.to_crs(np.zeros((1, 3)))[0]
+    R = frame.R_el @ matrix_from_angles(np.radians(4.0), np.radians(3.0), np.radians(20.0))
+    camera = FrameCamera(WGS84.cartesian(np.radians(39.0), np.radians(32.0), 1200.0), R, 60.0, 0.01, 2000, 2000)
+    grid = MapGrid("EPSG:32636", east - 51.2, north + 51.2, 0.2, 512, 512)
+    y, x = np.mgrid[0:512, 0:512]
+    z = (0.5 * relief_m * (1.0 + np.sin(x / 40.0) * np.cos(y / 50.0))).astype(np.float32)
+    heights = HeightsOfTile(z, z, z, z, np.zeros(1, dtype=np.float32))
+    counted = Counted(camera)
+    ((_, pixels),) = pixels_of_tile(counted, Tile(0, 0, 512, 512), grid.where, None, heights)
+    assert counted.asked < 2000
+    lat, lon = grid.where(x.ravel().astype(float), y.ravel().astype(float))
+    true = camera.inverse(lat, lon, z.ravel().astype(float), 1000.0)
+    for got, origin, want in zip((pixels.line, pixels.sample), pixels.origin, true.T, strict=True):
+        assert np.abs(got.ravel() + origin - want).max() < 0.01
 
 
 @pytest.mark.parametrize("k1", [-8e-4, 1e-3])
