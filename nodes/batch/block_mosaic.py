@@ -99,7 +99,8 @@ def check_layers(layers: list[Layer]) -> None:
 
     Raises
     ------
-    UserError : nothing in any of them, other numbers of bands or data types, values of other scales or units
+    UserError : nothing in any of them, other numbers of bands or data types, values of other scales or units, bands of
+        other colours
     """
     if not layers:
         raise UserError("nothing to put together: no strip or image has a cell in the mosaic")
@@ -117,6 +118,13 @@ def check_layers(layers: list[Layer]) -> None:
                     f"{layer.name}: {what} of its bands: {_listed(mine)}, but {one.name} has {_listed(others)}: "
                     "wanted values that mean the same"
                 )
+    coloured = [layer for layer in layers if layer.colors]
+    for layer in coloured[1:]:
+        if layer.colors != coloured[0].colors:
+            raise UserError(
+                f"{layer.name}: its bands are {_listed(layer.colors)}, but those of {coloured[0].name} "
+                f"{_listed(coloured[0].colors)}: wanted bands that mean the same"
+            )
 
 
 def _listed(values: tuple[object, ...]) -> str:
@@ -571,6 +579,8 @@ def put_together(
     ------
     UserError : a file cannot be written, nothing in the mosaic
     """
+    from rasterio.enums import ColorInterp
+
     told = {key: read_json(_file(folder, "tiles", key, "json")) for key in tiles_of(layers)}
     boxes = np.array([t["box"] for t in told.values() if t["box"] is not None])
     if not len(boxes):
@@ -584,8 +594,10 @@ def put_together(
         {"TIFFTAG_SOFTWARE": "triline", **tags},
     )  # fmt: skip
     # what is meant by the values is said of them alone, not of numbers of layers and sigmas
+    colors = next((layer.colors for layer in layers if layer.colors), ())
     values = replace(
-        raster, descriptions=one.descriptions, scales=one.scales, offsets=one.offsets, units=one.units
+        raster, descriptions=one.descriptions, scales=one.scales, offsets=one.offsets, units=one.units,
+        colors=tuple(ColorInterp[name] for name in colors),
     )  # fmt: skip
     names = {"layers": ", ".join(f"{k + 1} {layer.name}" for k, layer in enumerate(layers))}
     source = replace(raster, bands=1, dtype="uint16", nodata=0, tags=names, descriptions=("layer of the cell",))

@@ -48,6 +48,7 @@ class Layer:
     tiles : (row, column) of the tiles of the mosaic with something in them
     told : for people: lines, what was left out
     descriptions, scales, offsets, units : of its bands as a `Raster` has them; empty where nothing is stated
+    colors : names of what its bands show, of rasterio's ``ColorInterp``; empty where they are grey or nothing is stated
     """
 
     name: str
@@ -68,6 +69,7 @@ class Layer:
     scales: tuple[float, ...] = ()
     offsets: tuple[float, ...] = ()
     units: tuple[str, ...] = ()
+    colors: tuple[str, ...] = ()
 
     def write(self, path: Path) -> None:
         write_json(path, asdict(self))
@@ -76,7 +78,7 @@ class Layer:
     def read(cls, path: Path) -> Layer:
         found = read_json(path)
         found["tiles"] = [tuple(tile) for tile in found["tiles"]]
-        found |= {name: tuple(found.get(name, ())) for name in ("descriptions", "scales", "offsets", "units")}
+        found |= {name: tuple(found.get(name, ())) for name in ("descriptions", "scales", "offsets", "units", "colors")}
         return cls(**found)
 
 
@@ -276,6 +278,7 @@ def layer_of_orthoimage(
         tuple(np.array(values, dtype=object)[of].tolist())
         for values in (about.scales, about.offsets, about.units, about.descriptions)
     )
+    colors = tuple(about.colorinterp[k].name for k in of)
     scaled = any(scale != 1.0 for scale in scales) or any(offsets)
     told = {}
     if len(bands) < source.count:
@@ -286,6 +289,7 @@ def layer_of_orthoimage(
         descriptions=tuple(text or "" for text in words) if any(words) else (),
         scales=scales if scaled else (), offsets=offsets if scaled else (),
         units=tuple(unit or "" for unit in units) if any(units) else (),
+        colors=() if {"gray", "undefined"}.issuperset(colors) else colors,
     )  # fmt: skip
 
 

@@ -329,6 +329,8 @@ def write_virtual(path: Path, raster: Raster, tiles: list[TilePlace]) -> None:
         for name, values in (("UnitType", raster.units), ("Offset", raster.offsets), ("Scale", raster.scales)):
             if values:
                 out.append(f"<{name}>{escape(str(values[band - 1]))}</{name}>")
+        if raster.colors:
+            out.append(f"<ColorInterp>{raster.colors[band - 1].name.capitalize()}</ColorInterp>")
         for tile in tiles:
             top, left = max(tile.row, 0), max(tile.column, 0)
             height = min(tile.row + tile.rows, raster.rows) - top

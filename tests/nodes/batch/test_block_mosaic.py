@@ -401,13 +401,44 @@ def test_a_mosaic_says_what_the_values_of_its_orthoimages_mean(tmp_path, capsys)
     assert wanted in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("dtype", "bands"), [("uint8", 3), ("uint16", 4)])
+def test_a_mosaic_has_the_colours_of_its_orthoimages(tmp_path, capsys, dtype, bands):
+    """All bands of a mosaic were undefined, shown in grey; of orthoimages some may state none."""
+    from rasterio.enums import ColorInterp
+
+    values = np.random.default_rng(2).integers(60, 120, (bands, 200, 300)).astype(dtype)
+    rgb = [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.undefined][:bands]
+    grey = [ColorInterp.gray, *[ColorInterp.undefined] * (bands - 1)]
+    paths = [tmp_path / f"ortho{k}.tif" for k in range(2)]
+
+    def write(k, colors):
+        place = rasterio.Affine(2, 0, 500_000 + 200 * k, 0, -2, 5_000_000)
+        shape = {"driver": "GTiff", "height": 200, "width": 200, "count": bands, "dtype": dtype, "crs": "EPSG:32632"}
+        with rasterio.open(paths[k], "w", transform=place, nodata=0, photometric="MINISBLACK", **shape) as target:
+            target.colorinterp = colors
+            target.write(values[:, :, 100 * k : 100 * k + 200])
+
+    write(0, grey)
+    write(1, rgb)
+    for out in (tmp_path / "m.tif", tmp_path / "m.vrt"):
+        words = ["rectify", *map(str, paths), "--mosaic", "-o", str(out), "--workers", "1", "-q"]
+        assert main(words) == 0
+        with rasterio.open(out) as mosaic:
+            assert list(mosaic.colorinterp) == rgb and (mosaic.read() == values).all()
+        with rasterio.open(tmp_path / f"m.source{out.suffix}") as source:
+            assert source.colorinterp[0] in (ColorInterp.gray, ColorInterp.undefined)
+    write(0, [*rgb[2::-1], *rgb[3:]])
+    assert main(words) == 1
+    assert "wanted bands that mean the same" in capsys.readouterr().err
+
+
 def test_a_layer_that_an_earlier_version_kept_is_read(tmp_path):
     """It says nothing of what its values mean."""
     path = tmp_path / "0.json"
     layer = Layer("A", "", "a.tif", "a.steepness.tif", None, 0, 0, 4, 4, 1, "uint8", 0.0, [(0, 0)], {})
     layer.write(path)
     kept = json.loads(path.read_text())
-    for name in ("descriptions", "scales", "offsets", "units"):
+    for name in ("descriptions", "scales", "offsets", "units", "colors"):
         del kept[name]
     path.write_text(json.dumps(kept))
     assert Layer.read(path) == layer
