@@ -232,7 +232,11 @@ class StripRectifier:
 
     def _begin(self, least: int = 8) -> list[Patch]:
         """Lay the axes through the lines at hand."""
-        met = np.isfinite(self._cells).all(axis=2)
+        met: Mask = np.asarray(np.isfinite(self._cells).all(axis=2))
+        some = np.flatnonzero(met.any(axis=1))  # lines before the first that sees ground are of no use
+        without = int(some[0]) if len(some) else len(met)
+        self._forget(max(without, len(met) - MOST_WAITING))
+        met = met[len(met) - len(self._usable) :]
         count = met.sum(axis=0)
         rays = np.flatnonzero(2 * count >= max(int(count.max(initial=0)), 1))  # the ground may end under the others
         known = np.flatnonzero(met[:, rays].all(axis=1))
@@ -248,7 +252,9 @@ class StripRectifier:
         out: list[Patch] = []
         if self._axes is None or len(self._usable) < 2 or not np.isfinite(self._place).any():
             return out
-        columns = np.isfinite(self._place[..., 0]).any(axis=0)
+        met = np.isfinite(self._place[..., 0])
+        # rays that have left the ground that is known are not waited for
+        columns = met[np.flatnonzero(met.any(axis=1))[-NEWEST:]].any(axis=0)
         ahead = int(np.floor(np.nanmax(self._place[:, columns, 0], axis=0).min())) - 2
         if least == 1:  # the last lines: places that only some of the pixels have passed, too
             ahead = int(np.ceil(np.nanmax(self._place[..., 0]))) + 1
@@ -264,9 +270,9 @@ class StripRectifier:
                 out.append(patch)
             self._done = end
         with np.errstate(invalid="ignore"):
-            needed = (self._place[..., 0] >= self._done - 3).any(axis=1) | np.isnan(self._place[..., 0]).all(axis=1)
+            needed = np.flatnonzero((self._place[..., 0] >= self._done - 3).any(axis=1))
         taps = TAPS[self.resampling][1]
-        self._forget(max(int(np.argmax(needed)) - taps, 0))
+        self._forget(max(int(needed[0] if len(needed) else len(self._usable)) - taps, 0))
         return out
 
     def _empty_ahead(self, ahead: int) -> int:

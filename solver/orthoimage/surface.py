@@ -186,8 +186,8 @@ class HeightField:
         end = np.where(np.isfinite(z), z, float(np.nanmin(self.z_m)) - 1e-6)
         top, steepest = self._around(origin, slope, end)
         begin = np.minimum(top, origin[:, 2])
-        steep = (np.linalg.norm(slope, axis=1) * steepest >= 1.0) & (begin > end)
-        search = np.flatnonzero(down & (steep | np.isnan(z)))
+        steep = np.linalg.norm(slope, axis=1) * steepest >= 1.0
+        search = np.flatnonzero(down & (steep | np.isnan(z)) & (begin > end))
         if len(search):
             met = self._search(origin[search], slope[search], begin[search], end[search])
             z[search] = np.where(np.isfinite(met), met, z[search])

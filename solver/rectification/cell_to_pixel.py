@@ -234,14 +234,14 @@ class _Work:
 
     def height_of(self, tile: Tile) -> Float32 | None:
         """Heights of the cells of a part, None where it is the same everywhere."""
-        if isinstance(self.height, float):
+        if not isinstance(self.height, np.ndarray):
             return None
         row, column = tile.row - self.whole.row, tile.column - self.whole.column
         return self.height[row : row + tile.rows, column : column + tile.columns]
 
     def range_of(self, height: Float32 | None) -> tuple[float, float]:
         """Lowest and highest height of a part; of the whole tile where the part has none."""
-        if isinstance(self.height, float):
+        if not isinstance(self.height, np.ndarray):
             return self.height, self.height
         some = height if height is not None and np.isfinite(height).any() else self.height
         return float(np.nanmin(some)), float(np.nanmax(some))

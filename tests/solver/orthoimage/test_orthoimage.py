@@ -429,6 +429,36 @@ def test_ground_that_ends_under_a_strip_is_rectified_as_far_as_it_goes(oblique):
     assert (north < edge + 1.0).all() and (edge - north).min() < 45.0
 
 
+@pytest.mark.parametrize("unknown", ["beside", "across", "at first", "nowhere"])
+def test_lines_do_not_wait_for_ground_that_is_not_known(unknown, monkeypatch):
+    """A ray that had left the heights was waited for; lines that waited longest were left out of the orthoimage."""
+    monkeypatch.setattr("triline.solver.orthoimage.strip.MOST_WAITING", 2000)
+    x, y = np.meshgrid(np.arange(-200.0, 12_200.0, 20.0), np.arange(-600.0, 601.0, 20.0))
+    z = np.zeros(x.shape)
+    z[{
+        "beside": y > np.maximum(500.0 - 0.15 * x, 100.0), "across": abs(x - 2000.0) < 300.0, "at first": x < 8000.0,
+        "nowhere": x > np.inf,
+    }[unknown]] = np.nan  # fmt: skip
+    grid = GroundGrid(replace(FRAME, crs="local"), 2.0)
+    strip = StripRectifier(rays_of(CAMERA, 1), HeightField(-200.0, -600.0, 20.0, z), grid)
+    patches, most = [], 0
+    for k in range(0, 6000, 200):
+        position = np.column_stack([2.0 * np.arange(k, k + 200), np.zeros(200), np.full(200, 1500.0)])
+        R = np.broadcast_to(np.eye(3), (200, 3, 3))
+        patches += strip.add(k, np.full((200, PIXELS), 7, dtype=np.uint8), None, position, R)
+        most = max(most, len(strip._usable))
+    seen = _mosaic(patches + strip.finish())
+    row0, row1, column0, column1 = seen.extent()
+    east = grid.centre(np.arange(column0, column1), np.zeros(column1 - column0))[0]
+    filled = east[(seen.read(row0, row1, column0, column1) > 0).any(axis=0)]
+    assert most < 1000
+    assert filled[0] == pytest.approx(8000.0 if unknown == "at first" else 0.0, abs=25.0)
+    assert filled[-1] == pytest.approx(12_000.0, abs=25.0)
+    assert 2.0 * len(filled) == pytest.approx(
+        {"across": 11_400.0, "at first": 4000.0}.get(unknown, 12_000.0), abs=50.0
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize(("method", "order"), [("nearest", 0), ("bilinear", 1)])
 def test_resampling_as_scipy_does_it(method, order):
     rng = np.random.default_rng(8)
