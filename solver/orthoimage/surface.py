@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 from ..geometry import earth
 from ..geometry.frames import LocalFrame
@@ -21,7 +22,7 @@ TOLERANCE_M, ROUNDS = 1e-3, 12
 #: Steps a cell of the search along rays that the relief may be as steep as, and the most of them.
 STEPS_A_CELL, MOST_STEPS = 2.0, 4096
 #: Cells a side of the squares whose highest and steepest ground tells which rays are searched. Tuned.
-SQUARE_CELLS = 32
+SQUARE_CELLS = 8
 #: Rounds of a bent ray with the ground. Derived: the shift changes by 1e-4 of a change in height, which is itself the
 #: shift times the slope of the ground, so the second round leaves less than a millimetre.
 _AIR_ROUNDS = 2
@@ -183,21 +184,28 @@ class HeightField:
         slope = d[:, :2] / np.where(down, d[:, 2], np.nan)[:, None]
         z = self._correct(origin, slope)
         z[z > origin[:, 2]] = np.nan  # behind the sensor
-        end = np.where(np.isfinite(z), z, float(np.nanmin(self.z_m)) - 1e-6)
-        top, steepest = self._around(origin, slope, end)
-        begin = np.minimum(top, origin[:, 2])
-        steep = np.linalg.norm(slope, axis=1) * steepest >= 1.0
-        search = np.flatnonzero(down & (steep | np.isnan(z)) & (begin > end))
+        lowest, _, highest = self._heights
+        begin = np.minimum(highest + 1e-6, origin[:, 2])
+        met = np.isfinite(z)
+        end = np.where(met, z, lowest - 1e-6)
+        begin[met] = self._doubtful(origin[met], slope[met], z[met], begin[met])
+        search = np.flatnonzero(down & (begin > end))
+        search = search[self._may_pass(origin[search], slope[search], begin[search], end[search])]
         if len(search):
-            met = self._search(origin[search], slope[search], begin[search], end[search])
-            z[search] = np.where(np.isfinite(met), met, z[search])
+            first = self._search(origin[search], slope[search], begin[search], end[search])
+            z[search] = np.where(np.isfinite(first), first, z[search])
         xy = origin[:, :2] + slope * (z - origin[:, 2])[:, None]
         point = np.column_stack([xy, z])
         return point.reshape(shape), np.isfinite(z).reshape(shape[:-1])
 
     @cached_property
+    def _heights(self) -> tuple[float, float, float]:
+        """Lowest, middle and highest height of the nodes, m."""
+        return float(np.nanmin(self.z_m)), float(np.nanmedian(self.z_m)), float(np.nanmax(self.z_m))
+
+    @cached_property
     def _squares(self) -> Array:
-        """Highest ground (m) and its steepest slope (metres a metre) of squares of cells, (2, k, m)."""
+        """Highest ground (m) and its steepest slope (metres a metre) in and next to squares of cells, (2, k, m)."""
         rows, columns = self.z_m.shape
         starts = np.arange(0, columns, SQUARE_CELLS)
         out = []
@@ -208,25 +216,29 @@ class HeightField:
             steepest = np.hypot(*[np.where(np.isfinite(a), a, 0.0) for a in steps])
             high = np.where(np.isfinite(z[:n]), z[:n], -np.inf)
             out.append([np.maximum.reduceat(a.max(axis=0), starts) for a in (high, steepest)])
-        return np.stack(out, axis=1)
+        return np.asarray(maximum_filter(np.stack(out, axis=1), size=(1, 3, 3), mode="nearest"))
 
-    def _around(self, origin: Array, slope: Array, end: Array) -> tuple[float, float]:
-        """Height of the highest ground (m) and slope of the steepest (metres a metre) in the squares that rays pass
-        between the highest ground of all and their ends."""
+    def _doubtful(self, origin: Array, slope: Array, z: Array, top: Array) -> Array:
+        """Up to which height (n,) rays that meet the ground at heights z (n,) may have met it before; z for nowhere.
+
+        ``top`` : (n,) height above which there is no ground
+        """
         high, steep = self._squares
-        top = float(high.max())
-        ends = [origin[:, :2] + slope * (z - origin[:, 2])[:, None] for z in (end, np.minimum(top, origin[:, 2]))]
-        xy = np.concatenate(ends)
-        if not np.isfinite(xy).any():
-            return top, 0.0
-        side = SQUARE_CELLS * self.step_m
-        part = []
-        for low, at, n in ((self.y_m, xy[:, 1], high.shape[0]), (self.x_m, xy[:, 0], high.shape[1])):
-            # slopes of a square reach into the next one
-            first, last = ((float(f(at)) - low) / side for f in (np.nanmin, np.nanmax))
-            part.append(slice(int(np.clip(first - 1, 0, n - 1)), int(np.clip(last + 1, 0, n - 1)) + 1))
-        high, steep = high[tuple(part)], steep[tuple(part)]
-        return float(high.max()) + 1e-6, float(steep.max())
+        side, length = SQUARE_CELLS * self.step_m, np.linalg.norm(slope, axis=1)
+        until = z.copy()
+        left = np.flatnonzero((length > 0) & (z < top))
+        for k in range(MOST_STEPS):  # squares along the ray, from where it meets the ground
+            if not len(left):
+                break
+            rise = side / length[left]
+            low = z[left] + k * rise
+            xy = origin[left, :2] + slope[left] * (low + 0.5 * rise - origin[left, 2])[:, None]
+            j, i = ((xy - [self.x_m, self.y_m]) / side).astype(np.int64).T
+            at = np.clip(i, 0, high.shape[0] - 1), np.clip(j, 0, high.shape[1] - 1)
+            blocked = high[at] >= low if k else steep[at] * length[left] >= 1.0
+            until[left[blocked]] = (low + rise)[blocked]
+            left = left[low + rise < top[left]]
+        return np.minimum(until, top)
 
     def _above(self, origin: Array, slope: Array, z: Array) -> Array:
         """How far the ground lies above height z on each ray, m."""
@@ -235,7 +247,7 @@ class HeightField:
 
     def _correct(self, origin: Array, slope: Array) -> Array:
         """Heights (n,) by relief correction, NaN where it does not converge."""
-        z0 = np.full(len(origin), float(np.nanmedian(self.z_m)))
+        z0 = np.full(len(origin), self._heights[1])
         f0 = self._above(origin, slope, z0)
         z1 = z0 + f0
         for _ in range(ROUNDS):
@@ -250,10 +262,27 @@ class HeightField:
             z0, f0, z1 = z1, f1, z1 + change
         return np.where(np.abs(self._above(origin, slope, z1)) <= TOLERANCE_M, z1, np.nan)
 
+    def _may_pass(self, origin: Array, slope: Array, begin: Array, end: Array) -> Mask:
+        """Whether rays between two heights (n,) may be over the grid; all of them where it is endless."""
+        if self.endless:
+            return np.ones(len(origin), dtype=bool)
+        ends = np.stack([origin[:, :2] + slope * (z - origin[:, 2])[:, None] for z in (begin, end)])
+        low = np.array([self.x_m, self.y_m])
+        high = low + self.step_m * (np.array(self.z_m.shape[::-1]) - 1)
+        return np.asarray(((ends.max(axis=0) >= low) & (ends.min(axis=0) <= high)).all(axis=1))
+
     def _search(self, origin: Array, slope: Array, begin: Array, end: Array) -> Array:
         """Heights (n,) of the first crossing of each ray between two heights (n,), NaN where there is none."""
-        way = float(np.nanmax(np.linalg.norm(slope, axis=1) * (begin - end), initial=0.0))
-        steps = int(np.clip(np.ceil(STEPS_A_CELL * way / self.step_m), 8, MOST_STEPS))
+        way = np.linalg.norm(slope, axis=1) * (begin - end)
+        steps = 2 ** np.ceil(np.log2(np.clip(STEPS_A_CELL * way / self.step_m, 8, MOST_STEPS))).astype(int)
+        out = np.full(len(origin), np.nan)
+        for count in np.unique(steps).tolist():  # steep rays are not held up by flat ones
+            some = np.flatnonzero(steps == count)
+            out[some] = self._first(origin[some], slope[some], begin[some], end[some], count)
+        return out
+
+    def _first(self, origin: Array, slope: Array, begin: Array, end: Array, steps: int) -> Array:
+        """The same of rays that are looked at in so many steps."""
         high, low = begin.copy(), np.full(len(origin), np.nan)
         left = np.arange(len(origin))
         for share in np.linspace(0.0, 1.0, steps + 1):
