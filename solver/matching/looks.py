@@ -18,7 +18,7 @@ from .consistency import Disagreement, height_of
 from .line_scan import LineScan
 from .options import MatchedRay, MatchingOptions, Place
 from .prediction import WIDE, Prediction, sample_m
-from .search import Found, Ground, Image, find
+from .search import Found, Ground, Imagery, find
 
 Array = NDArray[np.floating]
 
@@ -125,7 +125,7 @@ class LookMatcher:
     Parameters
     ----------
     prediction : of the strip
-    image : gives the lines of a view: (index of the view, scan, way from line to line) -> `Image`
+    image : gives the lines of a view: (index of the view, scan, way from line to line) -> `Imagery`
     chip_half : half side of the patches that are kept for later strips, px; 0 for none
 
     Attributes
@@ -134,7 +134,7 @@ class LookMatcher:
     sees_from : lines from which on some of them do, that did not before
     """
 
-    def __init__(self, prediction: Prediction, image: Callable[[int, LineScan, float], Image], chip_half: int):
+    def __init__(self, prediction: Prediction, image: Callable[[int, LineScan, float], Imagery], chip_half: int):
         self.prediction = prediction
         self.counters: Counter[str] = Counter()
         self.seeing = frozenset(view.ccd for view in prediction.views)
