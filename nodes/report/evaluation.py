@@ -161,6 +161,8 @@ def missing(flight: Flight) -> list[str]:
         (bool(_given(flight, "check")), "check points (observation/control with role check)"),
     ]
     gaps = flight.poses["truth"].gaps() if "truth" in flight.poses else []
+    spans = [span for span in map(flight.strip_times, flight.strips) if span is not None]
+    gaps = [(a, b) for a, b in gaps if not spans or any(a < last and first < b for first, last in spans)]
     told = [
         f"truth/trajectory from {(a - flight.start_ns) / convert.SECOND_NS:.1f} to "
         f"{(b - flight.start_ns) / convert.SECOND_NS:.1f} s: nothing is compared there"

@@ -15,7 +15,7 @@ from ...solver.quantiles import chi2, norm
 from .. import convert
 from .evaluation import corrections_of, orientation_errors
 from .flight import Flight, Key, Look, PoseSeries, rejected_key, updates_with_new_rays
-from .strip_time import StripTime
+from .strip_time import StripTime, shortened
 from .style import CCDS, CHECK, CONTROL, FILTERED, FINAL, LIVE, REJECTED, TIE, TRUTH, figure, scale_note
 
 Array = NDArray[np.floating]
@@ -25,6 +25,7 @@ SYMBOLS = ("X", "Y", "Z", "ω", "φ", "κ")
 MDEG = 1000.0 * float(np.degrees(1.0))
 SCALE = np.array([1.0, 1.0, 1.0, MDEG, MDEG, MDEG])
 _TELLING = 30  # redundancy from which sigma0 is shown
+_NAME = 12  # letters of a strip on the map
 _MOST_ARROWS = 300  # residuals of a CCD line that are drawn; arrows of more would cover each other
 _SIGMAS = 3.0
 
@@ -86,7 +87,8 @@ def _strips(ax: Axes, flight: Flight, poses: PoseSeries, place: Any) -> None:
         ax.plot(x, y, color="#34495e", lw=2.4, solid_capstyle="butt", label="strip" if k == 0 else None)
         ax.annotate("", (x[-1], y[-1]), (x[-2], y[-2]), arrowprops={"arrowstyle": "-|>", "color": "#34495e", "lw": 2})
         text = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center", "color": "#34495e", "weight": "bold"}
-        ax.annotate(id, (x[0], y[0]), **text)
+        above = {"zorder": 7, "bbox": {"color": "white", "alpha": 0.6, "pad": 0.5, "lw": 0}}  # legible among points
+        ax.annotate(shortened(id, _NAME), (x[0], y[0]), **text, **above)
 
 
 def _misfits(ax: Axes, flight: Flight, place: Any, length_km: float, turned: bool) -> None:

@@ -158,13 +158,17 @@ def protection_figure(flight: Flight) -> Figure | None:
     if np.isfinite(error).any():
         curves.insert(0, ("error of the live orientation", np.abs(error), TRUTH, 0.7))
     for i, ax in enumerate(axes.T.ravel()):
+        drawn = {}
         for name, values, color, width in curves:
             x, y = axis.curve(t, _SCALE[i] * values[:, i : i + 1], _longest_s(flight))
+            drawn[name] = y[np.isfinite(y)]
             ax.plot(x, y[:, 0], color=color, lw=width, label=name)
             lone = _lone(y[:, 0])
             ax.plot(x[lone], y[lone, 0], color=color, ls="", marker=".", ms=3.0 + 2.0 * width)
         ax.set_yscale("log")
-        low, high = (_SCALE[i] * float(f(v[:, i])) for f, v in ((np.min, sigma), (np.max, protection)))
+        low = float(drawn["σ"].min(initial=np.inf))
+        high = float(drawn["protection level"].max(initial=0.0))
+        low = min(low, high)  # nothing is drawn of reports between strips
         bottom, top = 0.2 * max(low, 1e-6 * high, 1e-9), 1.5 * max(high, 1e-9)
         ax.set_ylim(bottom, top)
         ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if top < 300 * bottom else (1,)))

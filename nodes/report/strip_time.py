@@ -14,6 +14,14 @@ Array = NDArray[np.floating]
 _GAP = 0.025  # between strips, as a share of the time on strips
 _PAUSE_S = 2.0
 _SAMPLES = 1200  # of a curve; a page shows no more
+_LETTERS = 60  # of a name, and figures of a time, that the width of the axes has room for: half a page
+
+
+def shortened(name: str, letters: int) -> str:
+    """A name of at most so many letters: of a longer one the end, which tells strips apart; "" for fewer than four."""
+    if len(name) <= letters:
+        return name
+    return "…" + name[1 - letters :] if letters >= 4 else ""
 
 
 class StripTime:
@@ -31,7 +39,7 @@ class StripTime:
         for start, end, id in spans if len(spans) > 1 else ():
             self.strips.append((start, end, place, id))
             place += end - start + gap
-        self._gap = gap
+        self._gap, self._length = gap, max(place, 1e-9)
 
     def curve(self, time_s: Array, values: Array, pause_s: float = _PAUSE_S) -> tuple[Array, Array]:
         """Places and values of a thinned-out curve; NaN where its data pause for longer than ``pause_s``, so that no
@@ -58,12 +66,24 @@ class StripTime:
             if self.strips:
                 ax.grid(False, axis="x")
                 for start, end, place, id in self.strips:
-                    middle = place + (end - start) / 2
+                    middle, room = place + (end - start) / 2, int(_LETTERS * (end - start + self._gap) / self._length)
                     anchor = {"transform": ax.get_xaxis_transform(), "ha": "center", "va": "top"}
-                    ax.text(middle, 0.985, id, fontsize=7.5, color="#666666", clip_on=True, **anchor)
+                    name = shortened(id, room)
+                    ax.text(middle, 0.985, name, fontsize=7.5, color="#666666", clip_on=True, **anchor)
         for ax in lowest:
             if self.strips:
-                ax.set_xticks([place for _, _, place, _ in self.strips], [f"{start:.0f}" for start, *_ in self.strips])
+                ax.set_xticks([place for _, _, place, _ in self.strips], self._begins())
                 ax.set_xlabel("strips side by side; start of each [s]")
             else:
                 ax.set_xlabel("time [s]")
+
+    def _begins(self) -> list[str]:
+        """When each strip starts, s; "" where the one before leaves no room for it."""
+        told: list[str] = []
+        free = -np.inf  # from this place on
+        for start, _, place, _ in self.strips:
+            text = f"{start:.0f}"
+            half = (len(text) + 1) / 2 / _LETTERS * self._length
+            told.append(text if place - half >= free else "")
+            free = place + half if told[-1] else free
+        return told

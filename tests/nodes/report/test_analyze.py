@@ -6,9 +6,11 @@ import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from recording_file import write_recording
 from synthetic_flight import flight_messages, spoilt_copy
 
@@ -18,10 +20,11 @@ from triline.nodes.cli.demo import for_programs
 from triline.nodes.report.analysis import analyse
 from triline.nodes.report.evaluation import evaluate, evaluate_flight, measured_poses, orientation_errors
 from triline.nodes.report.figures import errors
-from triline.nodes.report.flight import collect, updates_with_new_rays
+from triline.nodes.report.flight import Flight, collect, updates_with_new_rays
 from triline.nodes.report.page import page
 from triline.nodes.report.source import read
 from triline.nodes.report.strip_time import StripTime
+from triline.nodes.report.style import figure, styled
 
 
 @pytest.fixture(scope="module")
@@ -306,6 +309,27 @@ def test_strips_stand_side_by_side_on_the_time_axis(messages):
     np.testing.assert_allclose(x[first], y[first] - 100.0)
     np.testing.assert_allclose(x[later] - x[later][0], y[later] - 500.0)
     assert 20.0 < x[later][0] < 22.0
+
+
+@pytest.mark.parametrize("name", ["S", "strip_over_the_northern_valley_"])
+def test_names_and_begins_of_many_strips_do_not_lie_upon_each_other(messages, name):
+    flight, template = Flight(), next(m.body for m in messages if m.topic == "configuration/strip")
+    for k, lines in enumerate([2000] * 18 + [30000, 30000]):
+        flight.strips[f"{name}{k}"] = strip = type(template)()
+        strip.first_line_time_ns, strip.line_rate_hz, strip.lines = (10 + 400 * k) * 10**9, 100.0, lines + 1
+    with styled():
+        fig = figure(5.9)
+        axes = fig.subplots(3, 2, sharex=True)
+        StripTime(flight).dress(axes.ravel(), axes[-1])
+        for ax in axes[:, 0]:
+            ax.set_xlim(-30.0, 1000.0)
+        FigureCanvasSVG(fig)
+        fig.draw_without_rendering()
+        for texts in (axes[0, 0].texts, axes[2, 0].get_xticklabels()):
+            boxes = [text.get_window_extent() for text in texts if text.get_text()]
+            assert len(boxes) >= 2 and all(a.x1 <= b.x0 for a, b in pairwise(boxes))
+        shown = [text.get_text() for text in axes[0, 0].texts]
+        assert shown[-1].endswith("19") and (name == "S" or shown[-1].startswith("…"))
 
 
 def test_updates_without_new_rays_do_not_count_as_latency():

@@ -136,6 +136,23 @@ def test_reports_that_are_as_far_apart_as_the_pace_for_throughput_makes_them(mes
     assert max(box.x1 for box in shades) == pytest.approx(start + 17.0, abs=0.1)
 
 
+def test_a_report_between_strips_does_not_set_the_scale_of_the_levels(messages):
+    """The window runs dry after a strip, and states protection levels of thousands of kilometres that are not drawn."""
+    flight = collect(messages)
+    stamp, last = next((stamp, r) for stamp, r in reversed(flight.reports) if len(r.protection) == 6)
+    flight.strips["S2"] = later = copy.deepcopy(flight.strips["S1"])
+    later.id, later.first_line_time_ns = "S2", stamp + 100 * convert.SECOND_NS
+    before = protection_figure(flight)
+    dry = m.AdjustmentReport()
+    dry.CopyFrom(last)
+    dry.protection[:] = [3e7] * 6
+    flight.reports.append((stamp + 50 * convert.SECOND_NS, dry))
+    after = protection_figure(flight)
+    assert before is not None and after is not None
+    for a, b in zip(before.axes, after.axes, strict=True):
+        assert a.get_ylim() == pytest.approx(b.get_ylim())
+
+
 def test_the_page_has_a_section_with_figure_and_units(messages, tmp_path, request):
     path = write_recording(tmp_path / "flight.mcap", messages)
     target = tmp_path / "report.html"

@@ -18,7 +18,7 @@ from triline.nodes.cli import main
 from triline.nodes.node import Message
 from triline.nodes.report.accuracy_table import accuracy_lines
 from triline.nodes.report.analysis import analyse
-from triline.nodes.report.evaluation import evaluate, evaluate_flight
+from triline.nodes.report.evaluation import evaluate, evaluate_flight, missing
 from triline.nodes.report.figures import progress, residuals, residuals_by_ccd, trajectory_map
 from triline.nodes.report.flight import collect
 from triline.nodes.report.page import page
@@ -495,3 +495,8 @@ def test_nothing_is_compared_across_a_gap_of_the_truth(messages, tmp_path):
     assert found["nees"] < 1.5 * whole["nees"] + 0.5
     assert 0.5 * whole["n"] < found["n"] < 0.95 * whole["n"]
     assert any("truth/trajectory from 1" in text and "nothing is compared there" in text for text in result["missing"])
+    # a turn that the simulator left out, or nobody recorded, is no part of what is compared
+    flight = collect(bent)
+    flight.strips["S1"].lines = int(flight.strips["S1"].line_rate_hz)
+    assert flight.strip_times("S1")[1] < lost[0]
+    assert not any("truth/trajectory from" in text for text in missing(flight))
