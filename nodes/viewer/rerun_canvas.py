@@ -139,20 +139,32 @@ class RerunCanvas:
         self.stream.send_blueprint(made)
 
     def close(self) -> None:
-        """Write what still waits.
+        """Write what still waits, however slow a viewer takes it; one that a user has closed takes nothing more.
 
         Raises
         ------
         OSError : the file cannot be written
+        UserError : the viewer ended because it could not go on
         """
+        try:
+            while not self._flushed():
+                pass
+        finally:
+            self.stream.disconnect()
+
+    def _flushed(self) -> bool:
+        """Whether nothing waits any more, after some seconds."""
         try:
             self.stream.flush(timeout_sec=_FLUSH_S)
         except RuntimeError:  # the library does not say why
-            if self.file is None:
+            if self.file is not None:
+                raise OSError(errno.EIO, "its writer has given up, as on a full disk", str(self.file)) from None
+            if self.process is None:
                 raise
-            raise OSError(errno.EIO, "its writer has given up, as on a full disk", str(self.file)) from None
-        finally:
-            self.stream.disconnect()
+            if self.process.running:
+                return False
+            self.process.refuse_failure()
+        return True
 
 
 def open_canvas(mode: str) -> Canvas:

@@ -6,6 +6,7 @@ import atexit
 import contextlib
 import importlib.util
 import os
+import re
 import shutil
 import signal
 import socket
@@ -20,6 +21,8 @@ from ..errors import UserError
 LOOPBACK = "127.0.0.1"
 _FIRST_PORTS = {"grpc": 9876, "web": 9090}
 _START_TIMEOUT_S = 20.0
+_CLOSED = (0, -signal.SIGTERM, -signal.SIGINT)
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
 class ViewerProcess:
@@ -77,8 +80,28 @@ class ViewerProcess:
         return self.process.poll() is None
 
     def wait(self) -> None:
-        """Wait until the viewer is closed."""
+        """Wait until the viewer is closed.
+
+        Raises
+        ------
+        UserError : it ended because it could not go on
+        """
         self.process.wait()
+        self.refuse_failure()
+
+    def refuse_failure(self) -> None:
+        """Nothing while the viewer runs, or where a user has closed it.
+
+        Raises
+        ------
+        UserError : it ended because it could not go on
+        """
+        if self.process.poll() not in (None, *_CLOSED):
+            raise UserError(f"the viewer ended: {self._last_line()}; triline view: --web and --rrd FILE go without it")
+
+    def _last_line(self) -> str:
+        lines = self._log.read_text(errors="replace").strip().splitlines() if self._log.exists() else []
+        return _COLOUR.sub("", lines[-1]) if lines else "it said nothing"
 
     def close(self) -> None:
         """Stop the viewer and all its children."""
@@ -97,9 +120,9 @@ class ViewerProcess:
         deadline = time.monotonic() + _START_TIMEOUT_S
         while not all(_listening(port) for port in ports):
             if not self.running or time.monotonic() > deadline:
-                lines = self._log.read_text(errors="replace").strip().splitlines()
+                said = self._last_line()
                 self.close()
-                raise UserError(f"the viewer did not come up: {lines[-1] if lines else 'it said nothing'}")
+                raise UserError(f"the viewer did not come up: {said}")
             time.sleep(0.05)
 
 

@@ -26,7 +26,7 @@ from triline.nodes.errors import UserError
 from triline.nodes.node import Message
 from triline.nodes.viewer import scene
 from triline.nodes.viewer.canvas import NullCanvas
-from triline.nodes.viewer.rerun_canvas import open_canvas
+from triline.nodes.viewer.rerun_canvas import RerunCanvas, open_canvas
 from triline.nodes.viewer.rerun_process import ViewerProcess, _private_folder, viewer_binary
 from triline.nodes.viewer.viewer import Viewer
 from triline.schemas import codec
@@ -285,6 +285,61 @@ def test_native_viewer_without_a_display_is_refused(monkeypatch, recording, caps
     assert "--web or --rrd" in capsys.readouterr().err
     assert main(["node", "viewer"]) == 1
     assert "triline node viewer: --set mode=web" in capsys.readouterr().err
+
+
+class _Stream:
+    """A stream whose first two flushes fail."""
+
+    def __init__(self):
+        self.flushes, self.disconnected = 0, False
+
+    def log(self, *args, **kwargs):
+        pass
+
+    def flush(self, timeout_sec):
+        self.flushes += 1
+        if self.flushes <= 2:
+            raise RuntimeError("Flush timed out - not all log messages were sent")
+
+    def disconnect(self):
+        self.disconnected = True
+
+
+def _ended(tmp_path, code):
+    """The viewer as a program that says something and ends with a code; None: it goes on."""
+    viewer = ViewerProcess.__new__(ViewerProcess)
+    viewer._log = tmp_path / "viewer.log"
+    viewer._log.write_text("\x1b[2mstarting\x1b[0m\n\x1b[31mError\x1b[0m: no graphics adapter\n")
+    program = "import time; time.sleep(60)" if code is None else f"raise SystemExit({code})"
+    viewer.process = subprocess.Popen([sys.executable, "-c", program])
+    if code is not None:
+        viewer.process.wait(20)
+    return viewer
+
+
+def test_a_viewer_that_is_slow_gets_all(tmp_path):
+    viewer, stream = _ended(tmp_path, None), _Stream()
+    try:
+        RerunCanvas(stream, viewer).close()
+        assert stream.flushes == 3 and stream.disconnected
+    finally:
+        viewer.process.kill()
+        viewer.process.wait(20)
+
+
+def test_a_window_that_is_closed_while_it_loads_is_no_fault(tmp_path):
+    stream = _Stream()
+    RerunCanvas(stream, _ended(tmp_path, 0)).close()
+    assert stream.flushes == 1 and stream.disconnected
+
+
+def test_a_viewer_that_cannot_go_on_says_why(tmp_path):
+    viewer, stream = _ended(tmp_path, 1), _Stream()
+    with pytest.raises(UserError, match=r"^the viewer ended: Error: no graphics adapter; .*--web"):
+        RerunCanvas(stream, viewer).close()
+    assert stream.disconnected
+    with pytest.raises(UserError, match="no graphics adapter"):
+        viewer.wait()
 
 
 def test_view_command_writes_a_file(recording, messages, tmp_path, capsys):
