@@ -285,7 +285,7 @@ def _figure(study: Study) -> Any:
     """Planimetry and height: a row for each configuration, a colour for each number of control points."""
     from matplotlib import colormaps
     from matplotlib.lines import Line2D
-    from matplotlib.ticker import LogFormatter
+    from matplotlib.ticker import AutoLocator, LogLocator, NullFormatter
 
     from ..report.style import figure
 
@@ -309,8 +309,10 @@ def _figure(study: Study) -> Any:
             if row is study.best:
                 ax.plot(rmse, at, "o", markersize=9, markerfacecolor="none", markeredgecolor="#d62728")
         ax.set_xscale("log")
+        least, most = ax.get_xlim()
+        ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)) if most > 5 * least else AutoLocator())
         ax.xaxis.set_major_formatter("{x:g}")
-        ax.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
+        ax.xaxis.set_minor_formatter(NullFormatter())
         ax.set_xlabel("m")
         ax.set_title(name)
     panels[0].set_yticks(range(len(labels)), labels)

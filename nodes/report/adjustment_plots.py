@@ -21,6 +21,8 @@ Array = NDArray[np.floating]
 #: Image points drawn at most in a frame; arrows of more would cover each other.
 MOST_ARROWS = 150
 
+#: Of curves in the same colour.
+_STYLES: Any = ("-", (0, (5, 1.5)), (0, (1.2, 1)), (0, (5, 1, 1, 1)))
 _BLUE, _RED, _GREY, _GREEN = "#2b5d8a", "#c0392b", "#9aa5b1", "#3a7d44"
 
 
@@ -47,8 +49,9 @@ def draw_residuals(adjustment: Adjustment) -> Any:
     out[[r.ray for r in result.rejected if r.ray >= 0]] = True
     lines = [k for k in range(len(network.camera.lines)) if (rays.ccd == k).any()]
     strips = [i for i in range(len(network.strips)) if (rays.strip == i).any()]
+    height = 0.9 + 1.9 * len(strips)
     figure, axes = plt.subplots(
-        len(strips), len(lines), figsize=(1.5 + 4.2 * len(lines), 0.9 + 1.9 * len(strips)), squeeze=False, sharex="row"
+        len(strips), len(lines), figsize=(1.5 + 4.2 * len(lines), height), squeeze=False, sharex="row"
     )
     rms = float(np.sqrt(np.mean(s.v_px[~out] ** 2))) or 1.0
     for a, i in enumerate(strips):
@@ -79,7 +82,8 @@ def draw_residuals(adjustment: Adjustment) -> Any:
             if b == 0:
                 axis.set_ylabel("sample")
     figure.suptitle(
-        f"Residuals of line and sample; an arrow of 1/25 of a frame is {rms:.2f} px; {int(out.sum())} rejected (x)"
+        f"Residuals of line and sample; an arrow of 1/25 of a frame is {rms:.2f} px; {int(out.sum())} rejected (x)",
+        y=1.0 - 0.06 / height,
     )
     figure.tight_layout()
     return figure
@@ -138,9 +142,11 @@ def draw_corrections(adjustment: Adjustment) -> Any:
     layout = adjustment.result.solution.layout
     names = ("dX, m", "dY, m", "dZ, m", "domega, mdeg", "dphi, mdeg", "dkappa, mdeg")
     unit = np.array([1.0] * 3 + [1e3 * 180 / np.pi] * 3)
-    figure, axes = plt.subplots(2, 3, figsize=(13, 6.5), sharex=True)
+    names_of_sets = [set_name(adjustment, item) for item in layout.sets]
+    columns = max(1, 170 // (max(map(len, names_of_sets)) + 6))
+    rows = -(-len(names_of_sets) // columns) if len(names_of_sets) > 1 else 0
+    figure, axes = plt.subplots(2, 3, figsize=(13, 6.5 + 0.17 * rows), sharex=True, layout="constrained")
     colours = plt.get_cmap("tab10")
-    several = len(layout.sets) > 1
     for n, item in enumerate(layout.sets):
         extent = item.model.extent
         time = np.linspace(extent.start_s, extent.end_s, 400)
@@ -149,7 +155,8 @@ def draw_corrections(adjustment: Adjustment) -> Any:
         share = time - extent.start_s
         for c, axis in enumerate(axes.ravel()):
             colour = colours(n % 10)
-            axis.plot(share, value[:, c], color=colour, linewidth=1.3, label=set_name(adjustment, item))
+            drawn = {"color": colour, "linestyle": _STYLES[n // 10 % len(_STYLES)], "linewidth": 1.3}
+            axis.plot(share, value[:, c], label=names_of_sets[n], **drawn)
             axis.fill_between(
                 share, value[:, c] - sigma[:, c], value[:, c] + sigma[:, c], color=colour, alpha=0.18, linewidth=0
             )
@@ -158,8 +165,8 @@ def draw_corrections(adjustment: Adjustment) -> Any:
         axis.set_ylabel(names[c])
         if c >= 3:
             axis.set_xlabel("time from the start of the strip, s")
-    if several:
-        axes[0, 0].legend(fontsize=8, title="strip")
+    if rows:
+        handles = axes[0, 0].get_legend_handles_labels()
+        figure.legend(*handles, loc="outside lower center", ncols=columns, fontsize=8, title="strip")
     figure.suptitle("Corrections of the measured orientation, with one sigma")
-    figure.tight_layout()
     return figure

@@ -16,11 +16,13 @@ from ..jobs.records import write_whole
 from .batch_rows import light_words
 from .integrity import LIGHTS
 from .render import number, picture, render
+from .strip_time import shortened
 from .style import FILTERED, FINAL, LIVE, REJECTED, figure, styled
 
 _COLORS = {"good": FINAL, "weak": LIVE, "failed": "#c0392b", "": FILTERED}
 #: Flights that are named on the map; names of more would cover each other.
 _MOST_NAMES = 25
+_NAME = 30  # letters of a flight on the map
 
 
 def write_page(path: Path, result: dict[str, Any]) -> None:
@@ -139,19 +141,33 @@ def _map(rows: Sequence[dict[str, Any]]) -> Figure | None:
         chosen = [(x, y) for row, x, y in lines if _mood(row) == mood]
         for k, (x, y) in enumerate(chosen):
             label = (f"mostly {mood}" if mood else "light not known") if k == 0 else None
-            ax.plot(x, y, color=color, lw=1.6, solid_capstyle="butt", label=label)
+            dot = {"marker": ".", "markersize": 4.0, "markevery": [0]}  # seen where flights are far apart
+            ax.plot(x, y, color=color, lw=1.6, solid_capstyle="butt", label=label, **dot)
     if len(rows) <= _MOST_NAMES:
-        named: set[str] = set()
-        for row, x, y in lines:
-            if row["flight"] not in named:
-                named.add(row["flight"])
-                text = {"xytext": (3, 3), "textcoords": "offset points", "fontsize": 7, "color": "#34495e"}
-                ax.annotate(row["flight"], (x[0], y[0]), **text)
+        first = {row["flight"]: (float(x[0]), float(y[0])) for row, x, y in reversed(lines)}
+        apart = 0.03 * max(float(np.ptp(lon)), float(np.ptp(lat)) / shrink)
+        for (x, y), names in _by_place(first, apart):
+            left = x <= (lon.min() + lon.max()) / 2
+            text = {"fontsize": 7, "color": "#34495e", "ha": "left" if left else "right"}
+            name = shortened(names[0], _NAME) + (f" + {len(names) - 1}" if len(names) > 1 else "")
+            ax.annotate(name, (x, y), xytext=(3 if left else -3, 3), textcoords="offset points", **text)
     ax.set_xlabel("longitude [deg]")
     ax.set_ylabel("latitude [deg]")
     ax.ticklabel_format(useOffset=False)
     drawn.legend(loc="outside lower center", ncols=4)
     return drawn
+
+
+def _by_place(first: dict[str, tuple[float, float]], apart: float) -> list[tuple[tuple[float, float], list[str]]]:
+    """Places, longitude and latitude in degrees, each with the flights that begin less than ``apart`` from it."""
+    found: list[tuple[tuple[float, float], list[str]]] = []
+    for name, (x, y) in sorted(first.items()):
+        names = next((names for (a, b), names in found if max(abs(a - x), abs(b - y)) < apart), None)
+        if names is None:
+            found.append(((x, y), [name]))
+        else:
+            names.append(name)
+    return found
 
 
 def _curves(rows: Sequence[dict[str, Any]]) -> Figure | None:

@@ -1,5 +1,7 @@
 """What ``triline adjust`` says of its result: sigmas, what to expect of check points, thinned pictures, damage."""
 
+from types import SimpleNamespace as Names
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -108,6 +110,22 @@ def test_residuals_are_thinned_and_say_so(tmp_path):
         total = int(axis.get_title().rsplit(" of ", 1)[1])
         every = int(axis.get_title().rsplit("1 in ", 1)[1].split()[0])
         assert 75 < np.size(quiver.U) == -(-total // every) <= adjustment_plots.MOST_ARROWS and every > 1
+
+
+@pytest.mark.parametrize("name", ["S", "strip_over_the_valley_of_the_north_"])
+def test_the_legend_of_many_strips_hides_nothing(monkeypatch, name):
+    sets = [Names(number=k, model=Names(extent=Names(start_s=0.0, end_s=10.0 + k))) for k in range(24)]
+    monkeypatch.setattr(adjustment_plots, "set_name", lambda _, item: f"{name}{item.number}")
+    curves = np.zeros((400, 6)), np.tile(np.eye(6), (400, 1, 1))
+    monkeypatch.setattr(adjustment_plots, "correction_functions", lambda *_: curves)
+    figure = adjustment_plots.draw_corrections(Names(result=Names(solution=Names(layout=Names(sets=sets)))))
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    assert len(legend.get_texts()) == 24
+    assert all(legend.get_window_extent().y1 <= axis.get_tightbbox().y0 for axis in figure.axes)
+    assert legend.get_window_extent().x0 >= 0.0 and legend.get_window_extent().x1 <= figure.bbox.x1
+    looks = {(line.get_color(), str(line._dash_pattern)) for line in legend.get_lines()}
+    assert len(looks) == 24, "no two strips look alike"
 
 
 def test_a_damaged_recording_is_said_to_be_damaged(folder, tmp_path, capsys):

@@ -6,16 +6,20 @@ import csv
 import json
 import shutil
 from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace as Names
 
 import numpy as np
 import pytest
 from block_writer import write_block
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 
 from triline.nodes.batch.simulated_scenes import SceneSimulation, write_simulated_scenes
-from triline.nodes.cli import control_runs, main
+from triline.nodes.cli import control_runs, main, study_control
 from triline.nodes.cli.control_runs import Configuration, SceneBlock, Settings, pool_of, with_control
 from triline.nodes.formats.block_folder import read_block
 from triline.nodes.formats.scene_block import read_scene_block
+from triline.nodes.report.style import styled
 from triline.solver.adjustment.block_data import Apriori, BlockData, ImagePoints, KnownPoints
 from triline.solver.adjustment.confidence_set import confidence_set
 from triline.solver.camera.sensors import preset
@@ -339,3 +343,22 @@ def test_how_often_check_points_tell_the_wrong_way(tmp_path):
     print(told)
     assert told["4 before 9"] <= 4 and told["ppm before dgr"] <= 4
     assert told["9 before 4"] >= 15 and told["dgr before ppm"] >= 12
+
+
+@pytest.mark.parametrize("largest_m", [0.024, 0.06, 0.3, 40.0])
+def test_metres_below_the_picture_can_be_read(largest_m):
+    run = Names(configuration=Names(label="PPM 4 segments order 1, tls18"), control=4)
+    rows = [Names(run=run, rmse_m=np.full(3, size), sigma_m=np.full(3, 1.1 * size)) for size in (0.018, largest_m)]
+    given = Names(block=Names(axes=("X", "Y", "Z")), pool=Names(single=False), control={4: ()}, rows=rows, best=None)
+    with styled():
+        figure = study_control._figure(given)
+        FigureCanvasSVG(figure)
+        figure.draw_without_rendering()
+        for axes in figure.axes:
+            low, high = axes.get_xlim()
+            labels = zip(axes.get_xticks(), axes.get_xticklabels(), strict=True)
+            shown = [label for at, label in labels if low <= at <= high]
+            shown += [label for label in axes.get_xticklabels(minor=True) if label.get_text()]
+            boxes = sorted((label.get_window_extent() for label in shown), key=lambda box: box.x0)
+            assert len(boxes) >= 2 and all(a.x1 < b.x0 for a, b in pairwise(boxes))
+            assert not any("e" in label.get_text() for label in shown)
