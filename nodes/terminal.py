@@ -8,6 +8,8 @@ beneath, and cleans with `plain` what it draws.
 from __future__ import annotations
 
 import io
+import os
+import shutil
 import sys
 import unicodedata
 from collections.abc import Iterator
@@ -66,6 +68,16 @@ class CleanStream:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.stream, name)
+
+
+def redraws(stream: Any) -> bool:
+    """Whether a stream is a terminal on which lines are drawn over: neither a file nor a dumb one, as in editors."""
+    return bool(stream.isatty()) and os.environ.get("TERM", "").lower() not in ("dumb", "unknown")
+
+
+def width() -> int:
+    """Characters that fit on a line of the terminal."""
+    return max(shutil.get_terminal_size().columns - 1, 20)
 
 
 def drawing(stream: Any) -> TextIO:

@@ -53,7 +53,7 @@ from ..formats.scene_block import is_scene_block
 from ..recording.reader import RecordingReader
 from ..recording.remote import path_of
 from ..recording.summary import damage_lines
-from ..terminal import drawing, plain
+from ..terminal import drawing, plain, redraws, width
 from ..voices import RecordedVoices
 from .adjust_scenes import run_scenes
 from .dem_options import add_dem_options, dem_settings
@@ -563,7 +563,7 @@ class _ProgressLines:
 
     def __init__(self, args: argparse.Namespace):
         self.silent = args.quiet or (args.json and not args.verbose)
-        self.terminal = sys.stderr.isatty()
+        self.terminal = redraws(sys.stderr)
         self.phase = ""
 
     def __call__(self, event: Event) -> None:
@@ -575,7 +575,7 @@ class _ProgressLines:
                 return
         text = f"{self.phase}: {_words(event)}" if not isinstance(event, Phase) else f"{self.phase} ..."
         if self.terminal:
-            print(f"\r\x1b[K{plain(text)[:110]}", end="", file=drawing(sys.stderr), flush=True)
+            print(f"\r\x1b[K{plain(text)[: width()]}", end="", file=drawing(sys.stderr), flush=True)
         else:
             print(text, file=sys.stderr)
 

@@ -23,7 +23,7 @@ from ..jobs.plan import Plan, plans
 from ..jobs.pools import LocalPool, Pool
 from ..jobs.steps import STEPS, USUAL
 from ..jobs.work import Outcome, remove_working_folders
-from ..terminal import drawing, plain
+from ..terminal import drawing, plain, redraws
 
 EXAMPLE = """triline batch season/ -o results --workers 4
   triline batch 'season/*/flight.mcap' -o results --do process,adjust,analyze --with 'adjust --snoop --plots'
@@ -168,7 +168,7 @@ def _interruptible() -> Iterator[None]:
 @contextmanager
 def _told(progress: Progress, pool: Pool, args: argparse.Namespace) -> Iterator[Callable[[Outcome | None], None]]:
     """What is called with each job that has ended: a bar on a terminal, lines elsewhere; failures at once."""
-    if sys.stderr.isatty() and not (args.quiet or args.json):
+    if redraws(sys.stderr) and not (args.quiet or args.json):
         with _bar(progress, pool) as told:
             yield told
         return

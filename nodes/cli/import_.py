@@ -30,7 +30,7 @@ from ..formats.track import MOST_BORESIGHT_DEG, MOST_LEVER_ARM_M, Accuracy, Moun
 from ..formats.trajectory_csv import csv_has_latitudes
 from ..node import Message
 from ..recording.writer import RecordingWriter
-from ..terminal import drawing
+from ..terminal import drawing, redraws
 
 EXAMPLE = """triline import block_folder -o flight.mcap
   triline import day.sbet --flight flight_folder -o flight.mcap    # camera, mounting, control: of the folder"""
@@ -318,7 +318,7 @@ def _write(source: Path, imported: Imported, output: Path, platform: str, *, sho
 
 def _with_progress(messages: Iterable[Message], shown: bool) -> Iterator[Message]:
     """The messages; their number is shown in one line that is updated on a terminal, every 5 s elsewhere."""
-    terminal = sys.stderr.isatty()
+    terminal = redraws(sys.stderr)
     told = time.monotonic()
     for i, message in enumerate(messages):
         if shown and i % 1000 == 0 and time.monotonic() - told > (0.2 if terminal else 5.0):

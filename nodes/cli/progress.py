@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from ..terminal import drawing, plain
+from ..terminal import drawing, plain, redraws
 
 #: Time between two plain lines, s.
 _LINE_PERIOD_S = 5.0
@@ -18,7 +18,7 @@ def progress(text: str, quiet: bool = False) -> Iterator[Callable[[float], None]
     """Yield a function that takes the fraction done, 0 to 1."""
     if quiet:
         yield None
-    elif sys.stderr.isatty():
+    elif redraws(sys.stderr):
         from rich.console import Console
         from rich.markup import escape
         from rich.progress import Progress

@@ -16,7 +16,7 @@ from ..bus.authority import DESK_STATUSES
 from ..bus.downlink import share_of
 from ..bus.session import Bus
 from ..node import STOPPING
-from ..terminal import drawing, plain
+from ..terminal import drawing, plain, redraws
 from .monitor import LONGEST_NAME, LONGEST_TEXT, MOST_NODES, SILENT, Overview
 
 #: What is listened to.
@@ -221,7 +221,7 @@ def watch(bus: Bus, stop: threading.Event, title: str, quiet: bool = False) -> F
     for topic in TOPICS:
         bus.hear(topic, overview.take)
     bus.watch_fleet(overview.link)
-    if sys.stdout.isatty() and not quiet:
+    if redraws(sys.stdout) and not quiet:
         from rich.console import Console
         from rich.live import Live
 

@@ -15,7 +15,7 @@ from ...solver.window.quality.determinability import ESTIMATED
 from .. import convert
 from ..config import build
 from ..node import STOPPING, Message, Node
-from ..terminal import drawing, plain
+from ..terminal import drawing, plain, redraws
 
 if TYPE_CHECKING:
     from ..bus.program import ProgramOptions
@@ -207,7 +207,8 @@ def screen(overview: Overview, title: str, watch: SensorWatch | None = None) -> 
         ("queue", "right"),
         ("problems", "left"),
     ):
-        nodes.add_column(name, justify=justify, no_wrap=True)  # pyright: ignore[reportArgumentType]
+        room = 1 if name == "state" else None  # gives way where the terminal is narrow
+        nodes.add_column(name, justify=justify, no_wrap=True, ratio=room)  # pyright: ignore[reportArgumentType]
     for name in sorted(overview.nodes):
         s = overview.nodes[name]
         bad = {k: sum(getattr(t, k) for t in s.topics) for k in LOSSES}
@@ -256,7 +257,8 @@ def _sensor_table(watch: SensorWatch) -> Any:
 
     table = Table(box=None, pad_edge=False, expand=True)
     for name, justify in (("sensor", "left"), ("rate", "right"), ("messages", "right"), ("", "left")):
-        table.add_column(name, justify=justify, no_wrap=True)  # pyright: ignore[reportArgumentType]
+        room = None if name else 1
+        table.add_column(name, justify=justify, no_wrap=True, ratio=room)  # pyright: ignore[reportArgumentType]
     for row in watch.rows():
         style = {"comes in": "green", "stopped": "bold red"}.get(row.state, "yellow")
         rate = f"{row.rate_hz:.1f}/s" if row.state == "comes in" else "-"
@@ -286,7 +288,7 @@ def display(
 
     if quiet:
         yield lambda: (look(), None)[1]
-    elif sys.stdout.isatty():
+    elif redraws(sys.stdout):
         from rich.console import Console
         from rich.live import Live
 
@@ -331,7 +333,7 @@ def watch_platform(options: ProgramOptions, quiet: bool = False) -> Overview:
     with options.open_bus() as bus, in_thread(BusRunner(monitor, bus)), display(monitor.overview, title, quiet) as show:
         while not options.stop.wait(0.25):
             show()
-    if not quiet and not sys.stdout.isatty():
+    if not quiet and not redraws(sys.stdout):
         sys.stdout.write(f"{monitor.overview.line()}\n")
         sys.stdout.flush()
     return monitor.overview
