@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import AutoLocator, Locator, LogLocator, NullFormatter
 
 from ...solver.accuracy import angle_difference
 from ...solver.navigation.error_state import Innovation
@@ -94,7 +94,7 @@ def sigmas(stretches: list[Navigated], gnss: GnssData) -> Figure:
                     )  # fmt: skip
     for axis, unit in zip(axes, ("position, m", "velocity, m/s", "attitude, deg"), strict=True):
         axis.set_ylabel(unit)
-        axis.yaxis.set_major_locator(LogLocator(10.0, subs=_ticks(axis), numticks=15))
+        axis.yaxis.set_major_locator(_ticks(axis))
         axis.yaxis.set_major_formatter(lambda v, _: f"{v:g}")
         axis.yaxis.set_minor_formatter(NullFormatter())
     for axis in (axes[0], axes[2]):
@@ -191,13 +191,14 @@ def _times(stretch: Navigated) -> Any:
     return np.linspace(stretch.best.start_s, stretch.best.end_s, n)
 
 
-def _ticks(axis: Any) -> tuple[float, ...]:
-    """Multiples of powers of ten at which a logarithmic axis has ticks."""
+def _ticks(axis: Any) -> Locator:
+    """Where a logarithmic axis has ticks: at multiples of powers of ten, and where few are in view at even steps."""
     low, high = axis.get_ylim()
     decades = float(np.log10(high / low))
-    if decades > 2.0:
-        return (1.0,)
-    return (1.0, 2.0, 5.0) if decades > 1.0 else (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
+    if decades < 0.6:
+        return AutoLocator()
+    several = (1.0, 2.0, 5.0) if decades > 1.0 else (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
+    return LogLocator(10.0, subs=(1.0,) if decades > 2.0 else several, numticks=15)
 
 
 def _time_axis(axes: Any, stretches: list[Navigated], gnss: GnssData) -> None:

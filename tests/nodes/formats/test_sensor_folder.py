@@ -9,6 +9,7 @@ import inertial_flights as sim
 import numpy as np
 import pytest
 from full_disk import files_of_at_most
+from matplotlib.figure import Figure
 from recording_file import write_recording
 
 from triline.nodes.cli import main
@@ -423,3 +424,12 @@ def test_the_plan_of_a_flight_across_the_date_line_is_as_large_as_the_flight(tmp
     monkeypatch.setattr(navigation_page, "_PLOTS", (("T", lambda *a: drawn.append(trajectory(*a)) or drawn[0], ""),))
     assert main(["navigate", str(folder), "-o", str(tmp_path / "out"), "-q"]) == 0
     assert np.ptp(drawn[0].axes[0].get_xlim()) < 20_000.0  # m; it was 40 000 km
+
+
+@pytest.mark.parametrize("sigmas", [(0.85, 1.45), (0.9, 1.2), (0.3, 0.8), (0.02, 0.1), (0.01, 0.7), (1e-3, 2.0)])
+def test_sigmas_can_be_read_whatever_their_range(sigmas):
+    axis = Figure().add_subplot()
+    axis.semilogy([0.0, 1.0], sigmas)
+    axis.yaxis.set_major_locator(navigation_plots._ticks(axis))
+    low, high = axis.get_ylim()
+    assert 2 <= sum(low <= tick <= high for tick in axis.get_yticks()) <= 8
