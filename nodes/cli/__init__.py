@@ -36,7 +36,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "info": ("info", "what a recording holds"),
     "new": ("new", "a commented flight folder to fill in"),
     "check": ("check", "whether a recording is whole, or what a flight folder lacks"),
-    "recover": ("recover", "a valid recording from a broken one"),
+    "recover": ("recover", "a valid recording from a broken one, or from the parts of a flight"),
     "export": ("export", "topics to CSV, Parquet, GeoJSON/GeoPackage, SBET"),
     "import": ("import_", "flight folder, poses, sensors, image lines and others to a recording"),
     "locate": ("locate", "pixels to the ground and back, by any sensor or RPC"),

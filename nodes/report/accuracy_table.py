@@ -21,8 +21,9 @@ _POINTS = {
 }
 _INTERSECTED = {"direct_georeferencing": "direct georeferencing", "final": "intersected, final pose"}
 _HEAD = f"{'n':>6}       X       Y       Z  "
-#: How the line begins that says in ``missing`` of an evaluation that nothing was measured in images.
-NO_TIES = "observation/tie"
+#: How the lines begin that say in ``missing`` of an evaluation that nothing was measured in images, and that there is
+#: nothing to compare object points with.
+NO_TIES, NO_TRUTH, NO_CHECK = "observation/tie", "truth/point", "check points"
 _NOTE = "sigma: root mean of the stated variances; NEES: squared errors over stated variances, 1 expected"
 
 
@@ -65,8 +66,11 @@ def _conclusion(result: dict[str, Any], points: dict[str, Any]) -> list[str]:
         lines.append(f"{'  improvement, final':<34}" + "".join(f"{v:7.1f}x" if v else "       -" for v in gain))
     elif not points:
         why = "the flight was too short, or no point got two looks"
-        if any(line.startswith(NO_TIES) for line in result["missing"]):
+        lacks = {name for name in (NO_TIES, NO_TRUTH, NO_CHECK) for line in result["missing"] if line.startswith(name)}
+        if NO_TIES in lacks:
             why = "there is no tie point in it"
+        elif {NO_TRUTH, NO_CHECK} <= lacks:
+            why = "there is no check point in it, and no truth of the tie points"
         lines.append(f"  none: {why}")
     lines.append(_NOTE)
     if "sigma0" in result:

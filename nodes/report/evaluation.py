@@ -17,7 +17,7 @@ from ...solver.geometry.rotation import matrix_from_navigation, quaternion_from_
 from ...solver.geometry.space_intersection import ImageRays, Intersection, intersect
 from ...solver.geometry.trajectory import Trajectory
 from .. import convert
-from .accuracy_table import NO_TIES
+from .accuracy_table import NO_CHECK, NO_TIES, NO_TRUTH
 from .flight import Flight, Look, PoseSeries, collect, in_gap, rejected_key
 
 Array = NDArray[np.floating]
@@ -155,10 +155,10 @@ def missing(flight: Flight) -> list[str]:
         (bool(flight.measured), "trajectory/filtered or trajectory/smoothed: no direct georeferencing"),
         ("final" in flight.poses, f"orientation/final: {why}"),
         ("truth" in flight.poses, "truth/trajectory: no error of the orientation (truth is known in simulations only)"),
-        (bool(flight.truth_points), "truth/point: no error of the object points"),
+        (bool(flight.truth_points), f"{NO_TRUTH}: no error of the object points"),
         (bool(flight.reports), "adjustment/report"),
         (bool(flight.points), "point/object"),
-        (bool(_given(flight, "check")), "check points (observation/control with role check)"),
+        (bool(_given(flight, "check")), f"{NO_CHECK} (observation/control with role check)"),
     ]
     gaps = flight.poses["truth"].gaps() if "truth" in flight.poses else []
     spans = [span for span in map(flight.strip_times, flight.strips) if span is not None]

@@ -8,6 +8,7 @@ import socket
 import struct
 import threading
 import time
+from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -136,6 +137,45 @@ def test_recover(capsys, flight, tmp_path):
     code, _, err = run(capsys, "recover", tmp_path / "junk", "-o", tmp_path / "x.mcap")
     assert code == 1 and "nothing in it that could be recovered" in err
     assert not (tmp_path / "x.mcap").exists()
+
+
+def test_the_parts_of_one_flight_become_one_recording(capsys, tmp_path):
+    """A recorder that begins a new file, or was started again: nothing took the parts as one flight."""
+    whole, one, two, joined = (tmp_path / f"{name}.mcap" for name in ("whole", "one", "two", "joined"))
+    numbers: Counter[str] = Counter()
+    messages = []
+    for message in sample.flight(6.0):
+        messages.append(replace(message, sequence=numbers[message.topic]))
+        numbers[message.topic] += 1
+    write_recording(whole, messages)
+    head = [message for message in messages if message.topic.startswith("configuration/")][:2]
+    middle = len(messages) // 2
+    write_recording(one, messages[: middle + 20])  # what both have heard is in both
+    write_recording(two, [*head, *messages[middle:]])
+    code, out, _ = run(capsys, "recover", two, one, "-o", joined, "--json")
+    result = json.loads(out)
+    assert code == 0 and result["messages"] == len(messages) and result["repeated"] == 20 + len(head)
+    assert result["recordings"] == [str(one), str(two)] and result["missing"] == {}
+    got, wanted = RecordingReader(joined), RecordingReader(whole)
+    for name in ("stamp_ns", "sequence"):
+        np.testing.assert_array_equal(getattr(got.index, name), getattr(wanted.index, name))
+    assert [m.topic for m in got.messages()] == [m.topic for m in wanted.messages()]
+    code, out, _ = run(capsys, "recover", one, two, "-o", joined)
+    assert (
+        f"kept {len(messages)} messages" in out and " of 2 recordings\n" in out and "that several of them hold" in out
+    )
+    assert "nothing was lost" in out
+    code, _, err = run(capsys, "recover", one, one, "-o", joined)
+    assert code == 1 and f"{one}: named twice" in err
+    other = tmp_path / "other.mcap"
+    with RecordingWriter(other, platform="another") as writer:
+        writer.write(messages[0])
+    with RecordingWriter(one, platform="aircraft") as writer:
+        writer.write(messages[0])
+    code, _, err = run(capsys, "recover", one, other, "-o", tmp_path / "x.mcap")
+    assert code == 1 and "wanted parts of one flight" in err and not (tmp_path / "x.mcap").exists()
+    code, _, err = run(capsys, "recover", one, joined, "-o", joined)
+    assert code == 1 and "would overwrite" in err
 
 
 def test_records_of_other_programs_are_no_damage_and_attachments_are_told(capsys, tmp_path):

@@ -213,6 +213,8 @@ def test_strips_of_one_ccd_line_in_any_direction_are_tied_by_their_images_alone(
     # on line, too: the strips wait for the looks that come when they are over
     assert main(["analyze", str(out), "--json", "-o", str(tmp_path / "r.html")]) == 0
     result = json.loads(capsys.readouterr().out)
+    assert main(["analyze", str(out), "-o", str(tmp_path / "r.html")]) == 0
+    assert "none: there is no check point in it, and no truth of the tie points" in capsys.readouterr().out
     whole, alone = (result["orientation"][name] for name in ("whole", "filtered"))
     assert 0.3 < whole["nees"] < 1.8
     assert (np.array(whole["sigma_m"]) < 0.75 * np.array(alone["sigma_m"])).all(), whole["sigma_m"]
