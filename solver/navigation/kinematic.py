@@ -11,9 +11,10 @@ Estimation with Applications to Tracking and Navigation, 2001, sections 5.4, 6.2
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
 from functools import cached_property
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,9 @@ class _Epoch:
     accepted: bool
 
 
+#: Steps between attitude samples whose median is the usual one. Tuned: a gap among them does not matter, a rate that
+#: changes is soon the usual one.
+USUAL_STEPS = 9
 #: While coasting, an epoch without a fix is put in after this time, s, so that the smoother has states to lean on.
 COAST_STEP_S = 0.5
 #: Times after an epoch for which the position covariance is computed, s; linear between them. Tuned.
@@ -65,6 +69,7 @@ class KinematicFilter:
         self.counters: Counter[str] = Counter()
         self._events: list[NavigationEvent] = []
         self._attitude = AttitudeHistory()
+        self._steps_s: deque[float] = deque(maxlen=USUAL_STEPS)
         self._maker = PoseMaker(frame, options.R_bc, options.attitude_sigma)
         self._epochs: list[_Epoch] = []
         self._pending: list[tuple[float, Array, Array]] = []
@@ -101,9 +106,11 @@ class KinematicFilter:
         if time_s <= last:
             self.counters["attitude duplicate" if time_s == last else "attitude out of order"] += 1
             return []
-        if time_s - last > self.options.attitude_gap_s and last > -np.inf:
-            self.counters["attitude gap"] += 1
-            self._event(time_s, f"attitude gap of {time_s - last:.2f} s")
+        if last > -np.inf:
+            if self._is_gap(time_s - last):
+                self.counters["attitude gap"] += 1
+                self._event(time_s, f"attitude gap of {time_s - last:.2f} s")
+            self._steps_s.append(time_s - last)
         left: list[NavigationPose] = []
         if time_s - last > self.options.coast_limit_s and last > -np.inf:
             left = self._start_anew(time_s)
@@ -120,6 +127,12 @@ class KinematicFilter:
             self._next_filtered_s = time_s + self.options.filtered_s - 1e-6
             poses.append(self._filtered(time_s, rpy))
         return poses
+
+    def _is_gap(self, step_s: float) -> bool:
+        """Whether a step between two attitude samples is longer than a usual one; of the first ones nobody knows."""
+        if step_s <= self.options.attitude_gap_s or len(self._steps_s) < USUAL_STEPS:
+            return False
+        return step_s > 1.5 * median(self._steps_s)
 
     def add_gnss(self, time_s: float, antenna_l: ArrayLike, covariance: ArrayLike) -> list[NavigationPose]:
         """One GNSS position of the antenna (3,), local frame, with covariance (3, 3); returns smoothed poses due.

@@ -38,7 +38,7 @@ class KinematicOptions:
     coast_limit_s, sigma_limit_m : longer without a fix, or a filter sigma (slow errors apart) above: not valid
     gate, hard_gate : normalised innovation squared of a position above which a fix is weighted down, or refused
     patience : so many refused fixes in a row mean that the filter is wrong; it starts again
-    attitude_gap_s : a longer step between attitude samples is a gap
+    attitude_gap_s : a longer step between attitude samples is a gap, if it is half as long again as the usual one
     filtered_s : least distance of filtered poses; 0 = one at each attitude sample
     """
 

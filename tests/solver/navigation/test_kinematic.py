@@ -210,6 +210,16 @@ def test_an_attitude_gap_is_counted():
     assert e.counters["attitude gap"] == 1
 
 
+@pytest.mark.parametrize("every", [19, 20, 40])  # 200 Hz: about ten samples a second and five
+def test_slow_attitude_has_no_gaps_but_those(every):
+    """Each second sample of a sensor with 10 Hz was told as "attitude gap of 0.10 s"."""
+    flight, e = Flight(20.0), engine()
+    keep = (np.arange(len(flight.t)) % every == 0) & ~((flight.t > 9.0) & (flight.t < 10.0))
+    flight.t, flight.rpy, flight.measured = flight.t[keep], flight.rpy[keep], flight.measured[keep]
+    flight.run(e)
+    assert e.counters["attitude gap"] == 1
+
+
 def test_after_a_long_silence_it_begins_again():
     flight, e = Flight(20.0), engine()
     keep = (flight.t < 5.0) | (flight.t > 12.0)
