@@ -487,10 +487,11 @@ class StripMatcher:
         share = master.view.ground_share
         looks = LookMatcher(p, lambda index, scan, travel: pair[index].image(scan, travel / share), 0)
         numbers = np.flatnonzero(p.seen(master.places))
-        tracks = {number: Track(master.places[number], 1) for number in numbers.tolist()}
-        if not self._found(looks, p, pair, list(tracks.values())):
-            self.counters["ground not found"] += len(tracks)
+        if not self._found(looks, p, pair, [Track(master.places[number], 1) for number in numbers.tolist()]):
+            self.counters["ground not found"] += len(numbers)
             return []
+        numbers = np.flatnonzero(p.seen(master.places))  # the ground may have been found at another height
+        tracks = {number: Track(master.places[number], 1) for number in numbers.tolist()}
         out: list[MatchedTie] = []
         waiting: list[tuple[int, Looked, int]] = []
         for part in _batches(np.array([master.places[i].line for i in numbers]), numbers):
