@@ -145,8 +145,8 @@ def _plain_sigma(row: NetworkSigma) -> dict[str, Any]:
         "sigma_xy_m": row.sigma_xy,
         "sigma_z_m": row.sigma_z,
         "sigma_m_of_placements": row.sigma_m.tolist(),
-        "published_rmse_over_sigma": [_number(p.rmse_xy / row.sigma_xy), _number(p.rmse_z / row.sigma_z)],
-        "sigma_over_published": [_number(row.sigma_xy / p.sigma_xy), _number(row.sigma_z / p.sigma_z)],
+        "published_rmse_over_sigma": [p.rmse_xy / row.sigma_xy, p.rmse_z / row.sigma_z],
+        "sigma_over_published": [row.sigma_xy / p.sigma_xy, row.sigma_z / p.sigma_z],
         "unsaid": row.network.unsaid,
     }
 
@@ -164,7 +164,7 @@ def _plain(row: Row) -> dict[str, Any]:
         "sigma_xy_m": row.sigma_xy,
         "sigma_z_m": row.sigma_z,
         "rmse_over_sigma": [row.ratio_xy, row.ratio_z],
-        "sigma0_px": _number(row.sigma0_px),
+        "sigma0_px": row.sigma0_px,
         "additional_parameters": row.parameters,
         "reason": row.configuration.reason,
     }
@@ -172,13 +172,9 @@ def _plain(row: Row) -> dict[str, Any]:
 
 def _published(p: Published) -> dict[str, Any]:
     return {
-        "rmse_xy_m": _number(p.rmse_xy),
-        "rmse_z_m": _number(p.rmse_z),
-        "sigma_xy_m": _number(p.sigma_xy),
-        "sigma_z_m": _number(p.sigma_z),
-        "sigma0_px": [_number(v) for v in p.sigma0_px],
+        "rmse_xy_m": p.rmse_xy,
+        "rmse_z_m": p.rmse_z,
+        "sigma_xy_m": p.sigma_xy,
+        "sigma_z_m": p.sigma_z,
+        "sigma0_px": list(p.sigma0_px),
     }
-
-
-def _number(value: float) -> float | None:
-    return None if math.isnan(value) else value

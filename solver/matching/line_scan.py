@@ -89,6 +89,12 @@ class LineScan:
     R_lc: Array
     ground_share: float = 1.0
 
+    @property
+    def way(self) -> Array:
+        """(2,) horizontal direction of the flight from its first line to its last, of length 1."""
+        way = self.position_l[-1, :2] - self.position_l[0, :2]
+        return way / np.linalg.norm(way)
+
     def to_plane(self, line: Array, sample: Array, height_m: Array) -> tuple[Array, Array]:
         """Ground points (n, 3) of pixels at given heights, and the rays' slopes dX/dZ, dY/dZ (n, 2).
 

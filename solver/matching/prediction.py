@@ -133,8 +133,7 @@ class Prediction:
     def ground(self, scan: LineScan, centre_l: Array) -> Ground:
         """Grids about places (k, 3); all of a strip have the same directions."""
         if self._axes is None:
-            way = scan.position_l[-1, :2] - scan.position_l[0, :2]
-            along = way / np.linalg.norm(way)
+            along = scan.way
             left = np.array([-along[1], along[0]])
             sample = self.views[self.master].sample
             self._axes = along, left if sample[0] < sample[-1] else -left

@@ -137,9 +137,7 @@ class _StripView:
     def image(self, scan: LineScan, travel: float) -> TurnedImage:
         """Its lines, for patches along any other strip; the platform's way from line to line is given."""
         assert self.ring is not None
-        way = scan.position_l[-1, :2] - scan.position_l[0, :2]
-        image = Image(scan, self.ring, travel * self.ground_share, self.lines.saturated)
-        return TurnedImage(image, way / np.linalg.norm(way))
+        return TurnedImage(Image(scan, self.ring, travel * self.ground_share, self.lines.saturated), scan.way)
 
 
 @dataclass(eq=False)
@@ -201,9 +199,7 @@ class _PairPrediction(Prediction):
         here, there = self.whole
         if index == 0 or here is None or there is None:
             return np.eye(2)
-        a, b = (
-            way / np.linalg.norm(way) for way in (s.position_l[-1, :2] - s.position_l[0, :2] for s in (here, there))
-        )
+        a, b = here.way, there.way
         cosine, sine = a @ b, a[0] * b[1] - a[1] * b[0]
         return np.array([[cosine, sine], [-sine, cosine]])
 

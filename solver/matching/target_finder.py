@@ -304,8 +304,7 @@ class TargetFinder:
         stretch = ring.read(int(line) - away, int(line) + away + 1)
         if len(stretch.pixels) < 2 * away or not (stretch.usable | stretch.filled).all():
             return NO_LINES
-        way = scan.position_l[-1, :2] - scan.position_l[0, :2]
-        along = way / np.linalg.norm(way)
+        along = scan.way
         turned = scan.view.sample[0] > scan.view.sample[-1]
         across = np.array([along[1], -along[0]]) if turned else np.array([-along[1], along[0]])
         r = pixel * np.arange(-half, half + 1)
@@ -369,8 +368,7 @@ class TargetFinder:
         line, sample, inside = scan.locate(xyz[None], np.array([nothing.line]), rounds=6)
         if not inside[0]:
             return nothing
-        way = scan.position_l[-1, :2] - scan.position_l[0, :2]
-        along = way / np.linalg.norm(way)
+        along = scan.way
         across = np.array([-along[1], along[0]])
         shaken = self._shaken(scan, float(line[0]), target.xyz_l[2])
         line_var = along @ centre.covariance @ along + (along @ shaken) ** 2

@@ -15,6 +15,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...camera.line_camera import LineCamera
+from ...geometry.ray_intersection import intersect_rays
 from ...geometry.rotation import matrix_from_angles
 from ..block.block import Block
 from ..state.lens_sets import lens_of
@@ -58,7 +59,8 @@ class FirstGround:
         rays, *_ = self._maker.rays([network.intake.points[name] for name in names])
         image = np.column_stack([rays.xy_mm, -rays.focal_length_mm])
         here = np.einsum("nij,nj->ni", matrix_from_angles(*rays.angles.T), image)
-        height = meeting_heights(rays.position_l, here, *(np.array(part) for part in zip(*kept, strict=True)))
+        position, ray = (np.array(part) for part in zip(*kept, strict=True))
+        height = meeting_heights(np.stack([rays.position_l, position]), np.stack([here, ray]))
         height = height[np.isfinite(height)]
         if len(height) < LEAST_MEETING:
             return []
@@ -66,21 +68,16 @@ class FirstGround:
         return names
 
 
-def meeting_heights(position_a: Array, ray_a: Array, position_b: Array, ray_b: Array) -> Array:
-    """Heights (n,) half-way between rays where they come nearest to each other; NaN for rays that are nearly parallel.
+def meeting_heights(position_l: Array, ray_l: Array) -> Array:
+    """Heights (n,) where pairs of rays meet; NaN for those that are nearly parallel, or meet behind a camera.
 
     Parameters
     ----------
-    position_a, position_b : (n, 3) where the rays begin
-    ray_a, ray_b : (n, 3) where they go, of any length
+    position_l, ray_l : (2, n, 3) where the rays begin, and where they go, of any length
     """
-    a = ray_a / np.linalg.norm(ray_a, axis=1)[:, None]
-    b = ray_b / np.linalg.norm(ray_b, axis=1)[:, None]
-    base, cosine = position_b - position_a, np.einsum("ni,ni->n", a, b)
-    sine2 = 1.0 - cosine**2
-    along_a, along_b = np.einsum("ni,ni->n", base, a), np.einsum("ni,ni->n", base, b)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        s = (along_a - cosine * along_b) / sine2
-        t = (cosine * along_a - along_b) / sine2
-    height = 0.5 * (position_a[:, 2] + s * a[:, 2] + position_b[:, 2] + t * b[:, 2])
-    return np.where((sine2 > LEAST_BASE**2) & (s > 0) & (t > 0), height, np.nan)
+    n = position_l.shape[1]
+    place_l, known = intersect_rays(position_l.reshape(-1, 3), ray_l.reshape(-1, 3), np.tile(np.arange(n), 2), n)
+    a, b = ray_l / np.linalg.norm(ray_l, axis=2)[:, :, None]
+    known &= np.linalg.norm(np.cross(a, b), axis=1) > LEAST_BASE
+    known &= (np.einsum("kni,kni->kn", place_l - position_l, ray_l) > 0.0).all(axis=0)
+    return np.where(known, place_l[:, 2], np.nan)

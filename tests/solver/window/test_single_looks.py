@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from three_strips import OPTIONS, PLAN, SIDE_BY_SIDE, TIES, flown, usual, usual_at_once, usual_online
+from noisy_surface import surface_below
+from three_strips import OPTIONS, PLAN, SENSORS, SIDE_BY_SIDE, TIES, flown, usual, usual_at_once, usual_online
 
 from triline.solver.camera.line_camera import LineCamera
 from triline.solver.camera.self_calibration import left_by_calibration
-from triline.solver.simulation.window_study import adjust_at_once, adjust_online, orientation_errors
+from triline.solver.simulation.scenario import ObservationPlan, simulate
+from triline.solver.simulation.window_study import adjust_at_once, adjust_online, navigate, orientation_errors
 from triline.solver.window import leaving
 from triline.solver.window.block import archive, points
 from triline.solver.window.block.points import SingleLook
@@ -19,6 +21,12 @@ from triline.solver.window.screening import first_ground
 from triline.solver.window.state.maker import BatchMaker
 
 ALONE = "too few looks"
+
+
+def nadir_alone():
+    """The camera of the flight with the CCD line that looks down, and no other."""
+    nadir = PLAN.camera.nadir_line
+    return LineCamera("one", tuple(lens for lens in PLAN.camera.lenses if lens.id == nadir.lens), (nadir,))
 
 
 @pytest.fixture(scope="module")
@@ -79,10 +87,7 @@ def test_a_camera_with_one_ccd_line_has_a_window_of_its_own_and_loses_no_ties():
     """The window was as long as the strip, so that updates took longer and longer. Here the only control lies at the
     beginning of the first strip: when looks that wait for the next strip leave the window, no point in it tells the
     height of the ground any more."""
-    camera = PLAN.camera
-    nadir = camera.lines[camera.line_index["N"]]
-    one = LineCamera("one", tuple(lens for lens in camera.lenses if lens.id == nadir.lens), (nadir,))
-    plan = replace(PLAN, camera=one, cross_strips=0, strip_s=50.0, sidelap=0.6)
+    plan = replace(PLAN, camera=nadir_alone(), cross_strips=0, strip_s=50.0, sidelap=0.6)
     simulation, poses = flown(plan, replace(TIES, control=30))
     looks, roles = simulation.images.looks, np.array(simulation.points.role)
     since_s = looks.time_s - simulation.flight.strip_times_s[looks.strip, 0]
@@ -104,10 +109,7 @@ def test_a_camera_with_one_ccd_line_has_a_window_of_its_own_and_loses_no_ties():
 def test_one_ccd_line_without_control_ties_its_strips(monkeypatch):
     """Nobody says where the ground is, 700 m nearer than looks are linearised at first: none of them tied anything."""
     monkeypatch.setattr(leaving, "NOBODY_KNOWS_M", 2200.0)
-    camera = PLAN.camera
-    nadir = camera.lines[camera.line_index["N"]]
-    one = LineCamera("one", tuple(lens for lens in camera.lenses if lens.id == nadir.lens), (nadir,))
-    simulation, poses = flown(replace(PLAN, camera=one), replace(TIES, control=0))
+    simulation, poses = flown(replace(PLAN, camera=nadir_alone()), replace(TIES, control=0))
     online = adjust_online(simulation, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
     batch = adjust_at_once(simulation, poses, OPTIONS)
     ties = {name: p for name, p in batch.final_points.items() if p.rays > 1}
@@ -121,15 +123,58 @@ def test_one_ccd_line_without_control_ties_its_strips(monkeypatch):
     assert max(known - o.time_s[-1] for known, o in zip(online.final_known_s, online.final, strict=True)) < 25.0
 
 
+def test_an_elevation_model_says_where_the_ground_is(monkeypatch):
+    """Before any rays meet: looks at a camera's first strip are linearised on it, and tie the next one."""
+    monkeypatch.setattr(first_ground, "LEAST_MEETING", 10**6)
+    simulation, poses = flown(replace(SIDE_BY_SIDE, camera=nadir_alone()), replace(TIES, control=0))
+    surface = surface_below(simulation, 3)
+    online = adjust_online(simulation, poses, OPTIONS, live=False, update_s=0.5, surface=surface)
+    batch = adjust_at_once(simulation, poses, OPTIONS, surface=surface)
+    ties = [name for name, p in batch.final_points.items() if p.rays > 1]
+    met = [name for name in ties if name in online.whole_points and online.whole_points[name].rays > 1]
+    assert len(met) > 0.95 * len(ties) > 15
+    for name in met:
+        wanted, whole = batch.final_points[name], online.whole_points[name]
+        assert np.abs((whole.xyz_l - wanted.xyz_l) / np.sqrt(np.diag(wanted.covariance))).max() < 0.3
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("world", ["as stated", "relief of 250 m", "blunders", "no stabilised mount", "500 m above"])
+def test_how_well_strips_of_one_ccd_line_are_tied_without_control(world):
+    """Three strips and one across them, four seeds: NEES of whole points, and their errors beside the batch."""
+    plan = replace(PLAN, camera=nadir_alone(), strips=3, strip_s=40.0, gap_s=60.0)
+    ties = ObservationPlan(
+        tie_points_per_s=6.0, control=0, check=12, outlier_share=0.03 if world == "blunders" else 0.0
+    )
+    plan = {
+        "relief of 250 m": replace(plan, relief_m=250.0),
+        "no stabilised mount": replace(plan, stabilised=False),
+        "500 m above": replace(plan, height_m=500.0, relief_m=50.0, speed_m_s=50.0),
+    }.get(world, plan)
+    nees, squares = [], []
+    for seed in range(1, 5):
+        simulation = simulate(plan, seed, SENSORS, ties)
+        poses = navigate(simulation)
+        online = adjust_online(simulation, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5).whole_points
+        batch = adjust_at_once(simulation, poses, replace(OPTIONS, snoop=True)).final_points
+        place = dict(zip(simulation.points.id, simulation.points.xyz_l, strict=True))
+        both = [name for name in batch if batch[name].rays > 1 and name in online]
+        assert len(both) > 0.9 * sum(p.rays > 1 for p in batch.values())
+        off = [np.array([points[name].xyz_l - place[name] for name in both]) for points in (online, batch)]
+        C = np.array([online[name].covariance for name in both])
+        nees.append(np.einsum("ni,nij,nj->n", off[0], np.linalg.inv(C), off[0]).mean() / 3.0)
+        squares.append([np.sum(v**2, axis=1).mean() for v in off])
+    ratio = np.sqrt(np.divide(*np.mean(squares, axis=0)))
+    print(f"{world}: NEES {np.mean(nees):.2f}, RMSE {ratio:.3f} times that of the batch")
+    assert 0.6 < np.mean(nees) < 1.6 and ratio < 1.1
+
+
 def test_strips_of_one_ccd_line_without_any_look_are_final(monkeypatch):
     """Their looks are waited for, not longer than 30 s after the strip, with no more of it than is bearable, and at the
     end of the flight no longer."""
     monkeypatch.setattr(leaving, "AWAITED_S", 4.0)
     monkeypatch.setattr(leaving, "MOST_AWAITED_S", 10.0)
-    camera = PLAN.camera
-    nadir = camera.lines[camera.line_index["N"]]
-    one = LineCamera("one", tuple(lens for lens in camera.lenses if lens.id == nadir.lens), (nadir,))
-    simulation, poses = flown(replace(SIDE_BY_SIDE, camera=one), replace(TIES, control=0))
+    simulation, poses = flown(replace(SIDE_BY_SIDE, camera=nadir_alone()), replace(TIES, control=0))
     none = replace(simulation, images=simulation.images.select(np.zeros(len(simulation.images.looks), dtype=bool)))
     online = adjust_online(none, poses, OPTIONS, live=False, update_s=0.5)
     for k, (begin, end) in enumerate(simulation.flight.strip_times_s):
@@ -145,9 +190,9 @@ def test_rays_say_how_high_they_meet():
     to = np.array([[100.0, 50.0, 20.0], [0.0, 0.0, -30.0], [0.0, 0.0, 0.0], [10.0, 0.0, 500.0]])
     a, b = np.array([[0.0, 0.0, 1000.0]] * 4), np.array([[400.0, 100.0, 1100.0]] * 4)
     b[2] = [0.0, 10.0, 1000.0]  # nearly parallel
-    rays = [to - a, 3.0 * (to - b)]
-    rays[0][3] *= -1.0  # behind the camera
-    height = first_ground.meeting_heights(a, rays[0], b, rays[1])
+    rays = np.stack([to - a, 3.0 * (to - b)])
+    rays[0, 3] *= -1.0  # behind the camera
+    height = first_ground.meeting_heights(np.stack([a, b]), rays)
     assert height[:2] == pytest.approx([20.0, -30.0]) and np.isnan(height[2:]).all()
 
 
