@@ -126,9 +126,9 @@ def test_beside_salib():
     from SALib.analyze import sobol as sobol_analyze
     from SALib.sample import sobol as sobol_sample
 
-    theirs = sobol_analyze.analyze(
-        problem, ishigami(sobol_sample.sample(problem, 4096, calc_second_order=False)), calc_second_order=False, seed=1
-    )
+    # without a seed it scrambles its sequence anew in each run, and one in some hundred is 0.03 off
+    drawn = sobol_sample.sample(problem, 4096, calc_second_order=False, seed=1)
+    theirs = sobol_analyze.analyze(problem, ishigami(drawn), calc_second_order=False, seed=1)
     ours = sobol(ishigami, CUBE, 4096)
-    np.testing.assert_allclose(ours.first[0], theirs["S1"], atol=0.03)
-    np.testing.assert_allclose(ours.total[0], theirs["ST"], atol=0.03)
+    np.testing.assert_allclose(ours.first[0], theirs["S1"], atol=0.01)
+    np.testing.assert_allclose(ours.total[0], theirs["ST"], atol=0.01)
