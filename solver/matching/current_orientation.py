@@ -14,7 +14,7 @@ Array = NDArray[np.floating]
 
 #: Corrections are averaged over so long: a live orientation moves a little at each update, and patches must not bend.
 KNOT_S = 1.0
-#: Poses and corrections older than this are forgotten, s.
+#: Poses and corrections older than this are forgotten where nothing else is said, s.
 KEPT_S = 120.0
 #: Poses are taken when orientation is asked for, or when so many have come. Tuned: with many more there is nothing left
 #: to gain (bench/poses.py); the poses that come out are the same with any number.
@@ -25,11 +25,22 @@ JUMP_SHARE, JUMP_S = 0.2, 0.5
 
 
 class CurrentOrientation:
-    """Measured poses and the corrections that an adjustment has found so far."""
+    """Measured poses and the corrections that an adjustment has found so far.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    kept_s : what is older is forgotten, s; infinity where the first line of a strip is asked for at its end
+
+    Attributes
+    ----------
+    changes : grows when orientation that was asked for before may be another one now
+    """
+
+    def __init__(self, kept_s: float = KEPT_S) -> None:
+        self._kept_s = kept_s
+        self.changes = 0
         self._trajectory = GrowingTrajectory()
-        self._smoother, self._steady = PoseSmoother(), SteadyPositions()
+        self._smoother, self._steady = PoseSmoother(), SteadyPositions(kept_s)
         self._new: list[tuple[float, Array, Array, Array]] = []
         self._last_s = -np.inf
         self._closed = False
@@ -77,14 +88,15 @@ class CurrentOrientation:
         self._new.clear()
         self._trajectory.append(*self._smoother.push(time_s, position_l, quaternion, covariance))
         newest_s = float(time_s[-1])
-        if len(self._trajectory) > 4096 and self._trajectory.start_s < newest_s - 2 * KEPT_S:
-            self._trajectory.forget(newest_s - KEPT_S)
+        if len(self._trajectory) > 4096 and self._trajectory.start_s < newest_s - 2 * self._kept_s:
+            self._trajectory.forget(newest_s - self._kept_s)
 
     def close(self) -> None:
         """No more poses come: those that wait for neighbours are taken as they are."""
         self._smooth()
         self._trajectory.append(*self._smoother.rest())
         self._closed = True
+        self.changes += 1
 
     def add_correction(self, time_s: float, correction: Array, covariance: Array) -> None:
         """Add what an adjustment adds to the measured pose at a time (6,), and the covariance (6, 6) of the sum."""
@@ -98,8 +110,9 @@ class CurrentOrientation:
         total, n = self._knots.get(knot, (np.zeros(6), 0))
         self._knots[knot] = [total + correction, n + 1]
         self._covariance[knot] = covariance
-        for old in [k for k in self._knots if k < knot - KEPT_S / KNOT_S]:
+        for old in [k for k in self._knots if k < knot - self._kept_s / KNOT_S]:
             del self._knots[old], self._covariance[old]
+        self.changes += 1
 
     def beyond_s(self, time_s: float) -> float:
         """So long after the newest correction a time is, s; 0 without corrections."""

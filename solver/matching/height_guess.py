@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 Array = NDArray[np.floating]
 
@@ -31,6 +32,7 @@ class HeightGuess:
     lowest_m: float = 0.0
     unknown: bool = False
     _points: Array = field(default_factory=lambda: np.empty((0, 3)))
+    _tree: KDTree | None = None  # of the points, once they are asked for
 
     @property
     def some(self) -> bool:
@@ -45,7 +47,7 @@ class HeightGuess:
         """The ground has to be looked for, from a lowest height on: it is not where it is thought to be."""
         if len(self._points):
             self.prior_m = float(np.median(self._points[-KEPT:, 2]))
-        self._points = np.empty((0, 3))
+        self._points, self._tree = np.empty((0, 3)), None
         self.lowest_m, self.unknown = min(lowest_m, self.prior_m), True
 
     def found(self, xyz_l: Array) -> None:
@@ -55,16 +57,15 @@ class HeightGuess:
 
     def add(self, xyz_l: Array) -> None:
         """Points (n, 3) that were found."""
-        self._points = np.concatenate([self._points, xyz_l])[-KEPT:]
+        self._points, self._tree = np.concatenate([self._points, xyz_l])[-KEPT:], None
 
     def at(self, xy: Array) -> tuple[Array, Array]:
         """Heights (n,) and their sigma (n,) at places (n, 2)."""
         if not self.some:
             return np.full(len(xy), self.prior_m), np.full(len(xy), self.prior_sigma_m)
-        distance = np.hypot(*(xy[:, None, :] - self._points[None, :, :2]).transpose(2, 0, 1))
-        n = min(NEIGHBOURS, len(self._points))
-        near = np.argpartition(distance, n - 1, axis=1)[:, :n]
-        d = np.take_along_axis(distance, near, axis=1)
+        if self._tree is None:
+            self._tree = KDTree(self._points[:, :2])
+        d, near = self._tree.query(xy, k=min(NEIGHBOURS, len(self._points)))
         z = self._points[near, 2]
         w = 1.0 / (d + 1e-3 * d.max() + 1e-6) ** 2
         w /= w.sum(axis=1, keepdims=True)

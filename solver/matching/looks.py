@@ -262,7 +262,7 @@ class LookMatcher:
         across = 2 * g.sample / p.views[p.master].pixels - 1
         return Looked(
             [track.place for track in enough], rays, np.array([track.score.min() for track in enough]), xyz,
-            Disagreement(p.times.time_of(line), across, residual), chip, holes, ground,
+            Disagreement(p.when(line, xyz), across, residual), chip, holes, ground,
         )  # fmt: skip
 
     def _geometry(self, tracks: Sequence[Track], scan: LineScan, height: Array) -> _Geometry:
@@ -286,7 +286,7 @@ class LookMatcher:
             pixel_m[1 + j] = sample_m(other, there, u)
         _, travel = p.height_and_travel()
         across = 2 * sample / p.views[p.master].pixels - 1
-        expected = p.slow.expected(p.times.time_of(line), across)
+        expected = p.slow.expected(p.when(line, centre), across)
         return _Geometry(scan, line, sample, ground, slope, travel, expected, shift, parallax, pixel_m)
 
     def _match_view(self, view: int, g: _Geometry, sigma_height: Array) -> tuple[Found, Array, Array] | None:

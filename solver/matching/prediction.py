@@ -120,6 +120,10 @@ class Prediction:
             return np.asarray(line + later)
         return self.times.line_of(self.times.time_of(line) + later / self.rate)
 
+    def when(self, line: Array, point_l: Array) -> Array:
+        """Times (k,) of looks, s: of ground (k, 3), seen in lines (k,) of the master. Slow errors change with it."""
+        return self.times.time_of(line)
+
     def scan(self, index: int, first: float, last: float) -> LineScan | None:
         """Lines of a view with their orientation, as far as there is one."""
         o = self.orientation

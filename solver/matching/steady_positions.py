@@ -29,14 +29,18 @@ FOURTH, HIGHEST = np.array([1.0, -4.0, 6.0, -4.0, 1.0]), 3.0
 LARGEST_SHARE = 0.35
 #: White noise reaches no higher in a block than so many of its sigmas (of fourth differences); it is no step.
 WHITE = 4.0
-#: Knots are kept as long as the poses are, s.
-KEPT_S = 120.0
 
 
 class SteadyPositions:
-    """Positions in, a curve through them out; as they came where the platform itself shakes too much for that."""
+    """Positions in, a curve through them out; as they came where the platform itself shakes too much for that.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    kept_s : the curve is kept so long, s
+    """
+
+    def __init__(self, kept_s: float = np.inf) -> None:
+        self._kept = float(np.rint(kept_s / POSITION_KNOT_S))
         self._time, self._position, self._size = np.empty(256), np.empty((256, 3)), 0
         self._knots: dict[int, tuple[Array, Array] | None] = {}
         self._open: dict[int, tuple[Array, Array] | None] = {}
@@ -78,7 +82,7 @@ class SteadyPositions:
                 self._settle(self._next)
                 self._next += 1
             self._next = max(self._next, int(np.floor((time_s - REACH_S) / POSITION_KNOT_S)))
-            oldest = self._next - round(KEPT_S / POSITION_KNOT_S)
+            oldest = self._next - self._kept
             self._knots = {number: knot for number, knot in self._knots.items() if number > oldest}
         while self._next * POSITION_KNOT_S + REACH_S <= time_s:
             self._settle(self._next)
@@ -126,7 +130,7 @@ class SteadyPositions:
         """All positions about a knot have come."""
         at_s = number * POSITION_KNOT_S
         knot = self._knots[number] = self._fit(at_s)
-        self._knots.pop(number - round(KEPT_S / POSITION_KNOT_S), None)
+        self._knots.pop(number - self._kept, None)
         if knot is None:
             return
         i = int(np.searchsorted(self._time[: self._size], at_s))

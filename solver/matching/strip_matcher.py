@@ -1,36 +1,35 @@
-"""Tie points between whole strips: of a satellite's telescopes, which see a place minutes apart, or of overpasses.
+"""Tie points between strips: of a satellite's telescopes, which see a place minutes apart, or of overpasses.
 
-Each strip has its own lines, line times and poses, and is kept. When it is over its views are matched with those that
-came before: places are chosen in a view that looks down more steeply than all that see the same ground, looked for in
-the earlier views, and later in each that follows. A point is told when a second view has it; its later looks follow one
-by one under its name. With one lens alone a second view may come days later: places are told as soon as their strip is
-over, so that an adjustment keeps these looks.
+Each strip has its own lines, line times and poses, and is kept. Its views are matched with those that came before:
+places are chosen in a view that looks down more steeply than all that see the same ground, looked for in the earlier
+views, and later in each that follows. A point is told when a second view has it; its later looks follow one by one
+under its name.
+
+With several lenses strips are matched when they are over. With one lens alone a second view may come much later:
+places are chosen while the strip is taken and told at once, so that an adjustment keeps these looks, and they are
+looked for in other strips as lines come in.
 """
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..camera.line_camera import LineCamera
-from .consistency import Disagreement
 from .current_orientation import CurrentOrientation
-from .ground_search import LEAST_FOUND, OVERLAP, SHARE, TOGETHER
+from .kept_strip import KeptStrip, StripView
 from .line_intake import LineIntake
-from .line_scan import LineScan, View, view_of
-from .line_store import LineRing, LineStore
+from .line_scan import view_of
+from .line_store import LineStore
 from .line_times import LineTimes
-from .looks import Looked, LookMatcher, Track
 from .options import MatchedRay, MatchedTie, MatchingOptions, Place, first_part_of_names
 from .places import PlaceChooser
-from .prediction import Prediction
-from .round_earth import RADIUS_M, RoundHeights, above_sphere
-from .search import LEAST_SQUARES_HALF, Image, TurnedImage
-from .waiting import BATCH
+from .round_earth import RoundHeights
+from .search import LEAST_SQUARES_HALF
+from .strip_pair import Master, StripPair
 
 Array = NDArray[np.floating]
 
@@ -41,212 +40,14 @@ POSES_KEPT = 512
 #: A view is steeper than another if it looks down more steeply by this, rad. Tuned: two lenses that look forward and
 #: backward alike count as equal.
 STEEPER = np.radians(2.0)
-#: No ground lies higher above the sphere, m, than the highest mountain, or nearer below the platform than this share of
-#: the way down to the lowest.
-HIGHEST_GROUND_M, LEAST_ABOVE = 9000.0, 0.1
 #: Standard deviation of a place before anything is matched with it, px: half of what it may be at most. Tuned.
 LONE_SIGMA_PX = 0.05
-#: A satellite that turns holds the view on the ground back to this share of its own way at most; and the largest angle
-#: from the way down for which the share is computed, rad. Bounds for what makes no sense.
-LEAST_SHARE, LARGEST_TILT = 0.05, np.radians(75.0)
-
-
-@dataclass(eq=False)
-class _Strip:
-    """A strip.
-
-    Attributes
-    ----------
-    id : its name
-    times : of its lines
-    views : its CCD lines, by name
-    over : whether its last line has come
-    """
-
-    id: str
-    times: LineTimes
-    orientation: CurrentOrientation = field(default_factory=CurrentOrientation)
-    views: dict[str, _StripView] = field(default_factory=dict)
-    over: bool = False
-
-    @property
-    def nbytes(self) -> int:
-        """Of the lines that have come."""
-        rings = [view.ring for view in self.views.values()]
-        return sum((r.end - r.start) * r.nbytes // r.capacity for r in rings if r is not None)
-
-
-@dataclass(eq=False)
-class _StripView:
-    """What one CCD line has seen in a strip."""
-
-    strip: _Strip
-    view: View
-    lines: LineIntake
-
-    @property
-    def ring(self) -> LineRing | None:
-        """Its lines; None before any has come."""
-        return None if self.lines.store is None else self.lines.store.rings[self.view.ccd]
-
-    @property
-    def known(self) -> bool:
-        """Whether there are lines and orientations."""
-        return self.ring is not None and bool(np.isfinite(self.strip.orientation.end_s))
-
-    def scan(self, first: float, last: float) -> LineScan | None:
-        """Some of its lines with their orientation, as far as there is one."""
-        strip, o = self.strip, self.strip.orientation
-        if not np.isfinite(o.end_s):
-            return None
-        low = max(int(np.floor(first)), int(np.ceil(strip.times.line_of(o.start_s))))
-        high = min(int(np.ceil(last)), int(np.floor(strip.times.line_of(o.end_s))))
-        if high - low < 4:
-            return None
-        position, R = o.at(strip.times.time_of(np.arange(low, high + 1)))
-        return LineScan(self.view, low, position, R, self.ground_share)
-
-    @cached_property
-    def ground_share(self) -> float:
-        """Way of the middle pixel on the ground as a share of the platform's way, over the whole strip."""
-        o = self.strip.orientation
-        position, R = o.at([o.start_s, o.end_s])
-        rays = R @ self.view.rays_c(np.array([0.5 * (self.view.pixels - 1)]))[0]
-        rays /= np.linalg.norm(rays, axis=1)[:, None]
-        tilt, above = self.tilt(), above_sphere(self.middle()[0])
-        way = position + rays * above / np.cos(min(tilt, LARGEST_TILT))
-        return max(float(np.linalg.norm(way[1] - way[0]) / np.linalg.norm(position[1] - position[0])), LEAST_SHARE)
-
-    def whole(self) -> LineScan | None:
-        """All of its lines."""
-        return None if self.ring is None else self.scan(self.ring.start, self.ring.end)
-
-    def middle(self) -> tuple[Array, Array]:
-        """Perspective centre and direction (3,) of the middle pixel in the middle of the strip."""
-        o = self.strip.orientation
-        position, R = o.at([0.5 * (o.start_s + o.end_s)])
-        ray = R[0] @ self.view.rays_c(np.array([0.5 * (self.view.pixels - 1)]))[0]
-        return position[0], ray / np.linalg.norm(ray)
-
-    def tilt(self) -> float:
-        """Angle between its middle and the way down, rad."""
-        position, ray = self.middle()
-        down = -position - np.array([0.0, 0.0, RADIUS_M])
-        return float(np.arccos(np.clip(ray @ down / np.linalg.norm(down), -1.0, 1.0)))
-
-    def image(self, scan: LineScan, travel: float) -> TurnedImage:
-        """Its lines, for patches along any other strip; the platform's way from line to line is given."""
-        assert self.ring is not None
-        return TurnedImage(Image(scan, self.ring, travel * self.ground_share, self.lines.saturated), scan.way)
-
-
-@dataclass(eq=False)
-class _Master:
-    """A view in which places were chosen, with the names of those that have become points."""
-
-    view: _StripView
-    places: list[Place]
-    names: dict[int, str] = field(default_factory=dict)
-
-
-class _PairPrediction(Prediction):
-    """Where the looks of a view (number 1) at places of another one (number 0) are to be expected."""
-
-    def __init__(self, pair: tuple[_StripView, _StripView], options: MatchingOptions, heights: RoundHeights):
-        super().__init__([v.view for v in pair], 0, options)
-        self._pair = pair
-        strip = pair[0].strip
-        self.orientation, self.heights = strip.orientation, heights
-        self.times = strip.times
-        self.whole = [v.whole() for v in pair]
-        self.height_and_travel()  # tells the heights whether the platform is in orbit
-
-    def height_and_travel(self) -> tuple[float, float]:
-        height, travel = super().height_and_travel()
-        return height, travel * self._pair[0].ground_share
-
-    def scan(self, index: int, first: float, last: float) -> LineScan | None:
-        return self._pair[index].scan(first, last)
-
-    def look_lines(self, index: int, line: Array, point_l: Array) -> Array:
-        whole = self.whole[index]
-        return np.asarray(line, dtype=float) if whole is None else _located(whole, point_l)[0]
-
-    def beside(self, along_too: bool) -> list[Array]:
-        """Shifts (2,) across the parallax, and along it too, px, at which a view is looked for: the nearest first, so
-        that searches cover three sigma of the orientation."""
-        here, there = self.whole
-        assert here is not None and there is not None
-        half = 0.5 * len(here.position_l)
-        middle, _ = here.to_plane(
-            np.array([here.first_line + half]), np.array([0.5 * (here.view.pixels - 1)]), np.array([self.nadir_m])
-        )
-        ground = self.ground(here, middle)
-        a, b = (v.middle()[1] for v in self._pair)
-        way = np.stack([ground.along, ground.across]) @ (a[:2] / a[2] - b[:2] / b[2])
-        along = way / max(float(np.linalg.norm(way)), 1e-9)
-        across = np.array([-along[1], along[0]])
-        reach = self.options.largest_reach_px
-        step = 2 * (1 - OVERLAP) * reach
-        n = int(np.ceil(max(self._three_sigma_px() - reach, 0.0) / step))
-        far = np.arange(-n, n + 1)
-        steps = np.stack(np.meshgrid(far if along_too else np.zeros(1), far, indexing="ij"), axis=-1).reshape(-1, 2)
-        nearest = steps[np.argsort(np.hypot(*steps.T), kind="stable")]
-        return list(step * nearest @ np.stack([along, across]))
-
-    def turn(self, index: int) -> Array:
-        """See `Prediction`."""
-        here, there = self.whole
-        if index == 0 or here is None or there is None:
-            return np.eye(2)
-        a, b = here.way, there.way
-        cosine, sine = a @ b, a[0] * b[1] - a[1] * b[0]
-        return np.array([[cosine, sine], [-sine, cosine]])
-
-    def angle(self, places: list[Place]) -> float:
-        """Angle at which the rays of both views meet on the ground, rad: the median of places; 0 where none is seen."""
-        here, there = self.whole
-        which = self.seen(places)
-        if here is None or there is None or not which.any():
-            return 0.0
-        line, sample = np.array([[p.line, p.sample] for p, sees in zip(places, which, strict=True) if sees]).T
-        point, _ = here.to_plane(line, sample, np.full(len(line), self.heights.prior_m))
-        other, _ = _located(there, point)
-        rays = [point - s.position_l[np.clip(np.nan_to_num(at).astype(int) - s.first_line, 0, len(s.position_l) - 1)]
-                for s, at in ((here, line), (there, other))]  # fmt: skip
-        a, b = (ray / np.linalg.norm(ray, axis=1)[:, None] for ray in rays)
-        return float(np.median(np.arcsin(np.clip(np.linalg.norm(np.cross(a, b), axis=1), 0.0, 1.0))))
-
-    def seen(self, places: list[Place]) -> NDArray[np.bool_]:
-        """Which places lie in the lines of the other view, about."""
-        here, there = self.whole
-        if here is None or there is None or not places:
-            return np.zeros(len(places), dtype=bool)
-        line, sample = np.array([[place.line, place.sample] for place in places]).T
-        height = np.full(len(line), self.heights.prior_m)
-        for _ in range(2):  # the ground falls away from the XY plane
-            height, _ = self.heights.at(here.to_plane(line, sample, height)[0][:, :2])
-        point, _ = here.to_plane(line, sample, height)
-        u, v = _located(there, point)
-        first, last = there.first_line, there.first_line + len(there.position_l)
-        three_sigma, most = self._three_sigma_px(), self.options.largest_reach_px
-        reach = max(three_sigma, most)
-        inside = (u > first - reach) & (u < last + reach)
-        if three_sigma <= most:  # else the view may lie beside where it is expected
-            inside &= (v > 0) & (v < there.view.pixels - 1)
-        return np.asarray(inside)
-
-    def _three_sigma_px(self) -> float:
-        """How far a look may lie from where the orientations put it, px."""
-        return self._orientation_reach(self.views[1], self.height_and_travel()[0] * self.views[0].pitch_mm
-                                       / self.views[0].focal_length_mm)  # fmt: skip
-
-
-def _located(scan: LineScan, point_l: Array) -> tuple[Array, Array]:
-    """Line and sample (n,) of points (n, 3), whatever line of a strip they are seen in."""
-    middle = np.full(len(point_l), scan.first_line + 0.5 * len(scan.position_l))
-    line, sample, _ = scan.locate(point_l, middle, rounds=10)
-    return line, sample
+#: Bands across the image in which places are chosen or not: none where the lines see so large a share of as many places
+#: of other strips. Tuned.
+BANDS, ENOUGH_SEEN = 16, 0.5
+#: While a strip of one lens is taken, it is matched so often, s. Tuned: looks have to come before the window of the
+#: adjustment has left them behind, and a few dozen of them cost hardly more than one.
+EVERY_S = 2.0
 
 
 class StripMatcher:
@@ -276,11 +77,11 @@ class StripMatcher:
         self._heights = RoundHeights(0.0, self.options.relief_sigma_m)
         self._poses: deque[tuple[float, Array, Array, Array]] = deque(maxlen=POSES_KEPT)
         self._strip = ""
-        self._strips: dict[str, _Strip] = {}
-        self._masters: list[_Master] = []
+        self._strips: dict[str, KeptStrip] = {}
+        self._masters: list[Master] = []
+        self._pairs: dict[tuple[Master, StripView], StripPair] = {}
         self._events: list[str] = []
         self._held, self._share = (0, 0), 1.0
-        self._numbers: Counter[str] = Counter()
         self._first_parts: dict[str, str] = {}  # of the names of points, by strip
 
     # -- input ---------------------------------------------------------------------------------------------------------
@@ -351,7 +152,7 @@ class StripMatcher:
         self._strip = strip
         if strip not in self._strips:
             self._first_parts[strip] = first_part_of_names(strip, first_line)
-            begun = self._strips[strip] = _Strip(strip, times)
+            begun = self._strips[strip] = KeptStrip(strip, times)
             for pose in self._poses:
                 if pose[0] >= times.first_s - POSES_BEFORE_S:
                     begun.orientation.add_pose(*pose)
@@ -373,7 +174,8 @@ class StripMatcher:
             samples = {ccd: self._views[ccd].pixels}
             lines = LineIntake(samples, self.options, lambda dtype: self._store(samples, dtype))
             lines.begin_strip(strip.times.rate, first_line)
-            strip.views[ccd] = _StripView(strip, self._views[ccd], lines)
+            chooser = PlaceChooser(self.options, 2 * LEAST_SQUARES_HALF + 1, 1)
+            strip.views[ccd] = StripView(strip, self._views[ccd], lines, chooser)
         lines = strip.views[ccd].lines
         usable = lines.add(ccd, first_line, pixels)
         self._events += lines.take_events()
@@ -395,8 +197,18 @@ class StripMatcher:
     # -- matching ------------------------------------------------------------------------------------------------------
 
     def match(self) -> list[MatchedTie]:
-        """No tie points: strips are matched when they are over."""
-        return []
+        """The tie points of the strip that is taken; with several lenses none before it is over."""
+        strip = self._strips.get(self._strip)
+        if strip is None or strip.over or not self._lone:
+            return []
+        return [tie for view in strip.views.values() if self._is_time(view) for tie in self._match(view)]
+
+    def _is_time(self, view: StripView) -> bool:
+        """Whether enough lines have come since the last time."""
+        if not view.known:
+            return False
+        assert view.ring is not None
+        return view.known_to - max(view.chosen_to, view.ring.start) >= EVERY_S * view.strip.times.rate
 
     def finish(self) -> list[MatchedTie]:
         """Nothing more comes: the tie points of strips that were not over."""
@@ -410,16 +222,11 @@ class StripMatcher:
         ended.over = True
         ended.orientation.close()
         self._make_room(ended)
-        out: list[MatchedTie] = []
-        for view in (v for v in ended.views.values() if v.known):
-            seen_by = [(master, p) for master in self._masters if (p := self._overlap(master, view)) is not None]
-            for master, p in seen_by:
-                out += self._look(master, view, p)
-            if not seen_by or (not self._lone and all(view.tilt() < m.view.tilt() - STEEPER for m, _ in seen_by)):
-                out += self._begin_master(view)
+        out = [tie for view in ended.views.values() if view.known for tie in self._match(view)]
+        self._pairs = {(m, v): pair for (m, v), pair in self._pairs.items() if ended not in (m.view.strip, v.strip)}
         return out
 
-    def _make_room(self, ended: _Strip) -> None:
+    def _make_room(self, ended: KeptStrip) -> None:
         """Forget the oldest strips where the budget is used up; tell where it did not hold all lines of a strip."""
         for ccd, view in ended.views.items():
             ring = view.ring
@@ -430,178 +237,90 @@ class StripMatcher:
             oldest = next(s for s in self._strips.values() if s is not ended)
             del self._strips[oldest.id]
             self._masters = [master for master in self._masters if master.view.strip is not oldest]
+            self._pairs = {k: pair for k, pair in self._pairs.items() if oldest not in (k[0].view.strip, k[1].strip)}
 
-    def _overlap(self, master: _Master, view: _StripView) -> _PairPrediction | None:
-        """The geometry of a master and a view that sees some of its places; None for one that sees none."""
-        p = _PairPrediction((master.view, view), self.options, self._heights)
-        return p if p.seen(master.places).any() else None
+    def _match(self, view: StripView) -> list[MatchedTie]:
+        """Match the lines of a view that have come since the last time with strips that are over."""
+        pairs = [self._pair(m, view, 1) for m in self._masters if m.view.strip is not view.strip and m.view.strip.over]
+        seen = [at[at[:, 0] >= view.chosen_to] for _, at in (pair.seen() for pair in pairs)]
+        out = [tie for pair in pairs for tie in self._matched(pair)]
+        if self._lone:
+            out += self._add_places(view, np.concatenate([np.empty((0, 2)), *seen])[:, 1])
+        else:
+            by = [pair.master.view for pair, at in zip(pairs, seen, strict=True) if len(at)]
+            if all(view.tilt() < other.tilt() - STEEPER for other in by):
+                out += self._begin_master(view)
+        view.chosen_to = view.known_to
+        return out
 
-    def _begin_master(self, view: _StripView) -> list[MatchedTie]:
+    def _pair(self, master: Master, view: StripView, late: int) -> StripPair:
+        if (master, view) not in self._pairs:
+            self._pairs[master, view] = StripPair(master, view, late, self.options, self._heights)
+        return self._pairs[master, view]
+
+    def _matched(self, pair: StripPair) -> list[MatchedTie]:
+        """The ties of a pair, and what it has to tell."""
+        out = pair.match()
+        self.counters.update(pair.counters)
+        pair.counters.clear()
+        self._events += pair.events
+        pair.events.clear()
+        return out
+
+    def _add_places(self, view: StripView, seen: Array) -> list[MatchedTie]:
+        """Choose places in the lines of a view that have come since the last time, for strips that come much later, as
+        points of one look.
+
+        Parameters
+        ----------
+        seen : (n,) samples at which these lines see places of others: no more are chosen beside them
+        """
+        master = next((m for m in self._masters if m.view is view), None)
+        if master is None:
+            master = Master(view, self._first_parts[view.strip.id])
+            self._masters.append(master)
+        chosen = self._chosen(view)
+        # each of them is a point at once, so that no more are needed than points are wanted
+        view.chooser.density.judged(
+            np.array([2 * p.sample / view.view.pixels - 1 for p in chosen]), np.ones(len(chosen), dtype=bool)
+        )
+        band, seen_band = (_band(at, view.view.pixels) for at in (np.array([p.sample for p in chosen]), seen))
+        enough = np.bincount(seen_band, minlength=BANDS) >= ENOUGH_SEEN * np.bincount(band, minlength=BANDS)
+        out = []
+        for place in (p for p, b in zip(chosen, band, strict=True) if not enough[b]):
+            master.places.append(place)
+            ray = MatchedRay(
+                view.view.ccd, place.line, place.sample, LONE_SIGMA_PX, LONE_SIGMA_PX, view.strip.id
+            )  # fmt: skip
+            out.append(MatchedTie(master.point(len(master.places) - 1), (ray,), 1.0, np.full(3, np.nan), 0.0))
+        return out
+
+    def _begin_master(self, view: StripView) -> list[MatchedTie]:
         """Choose places in all lines of a view, and match them with the earlier ones, those most like it first."""
+        mine = view.middle()[1]
         others = [v for s in self._strips.values() if s.over for v in s.views.values() if v is not view and v.known]
-        if not others and not self._lone:
+        others.sort(key=lambda v: -float(mine @ v.middle()[1]))
+        if not others:
             return []
-        ring, rate = view.ring, view.strip.times.rate
+        master = Master(view, self._first_parts[view.strip.id], self._chosen(view))
+        out = [tie for other in others for tie in self._matched(self._pair(master, other, 0))]
+        if out:  # else another one may have better luck
+            self._masters.append(master)
+        return out
+
+    def _chosen(self, view: StripView) -> list[Place]:
+        """Places in the lines of a view that have come since the last time."""
+        ring, chooser = view.ring, view.chooser
         assert ring is not None
-        chooser = PlaceChooser(self.options, 2 * LEAST_SQUARES_HALF + 1, 1)
         chooser.density.load = self._share
         chooser.density.window_holds(*self._held)
-        master = _Master(view, chooser.choose(ring, rate, ring.start, view.lines.saturated))
-        self.counters["places"] += chooser.tried
-        self.counters["cells without texture"] += chooser.empty
-        self._masters.append(master)
-        mine = view.middle()[1]
-        others.sort(key=lambda v: -float(mine @ v.middle()[1]))
-        out = self._told(master) if self._lone else []
-        for other in others:
-            p = self._overlap(master, other)
-            out += [] if p is None else self._look(master, other, p)
-        if not out:  # another one may have better luck
-            self._masters.remove(master)
-        return out
-
-    def _told(self, master: _Master) -> list[MatchedTie]:
-        """All places of a master as points of one look, for strips that come much later."""
-        strip, ccd = master.view.strip.id, master.view.view.ccd
-        out = []
-        for number, place in enumerate(master.places):
-            ray = MatchedRay(ccd, place.line, place.sample, LONE_SIGMA_PX, LONE_SIGMA_PX, strip)
-            out.append(MatchedTie(self._named(master, number), (ray,), 1.0, np.full(3, np.nan), 0.0))
-        return out
-
-    def _named(self, master: _Master, number: int) -> str:
-        """The name of a place of a master, from now on a point."""
-        if number not in master.names:
-            strip = master.view.strip.id
-            self._numbers[strip] += 1
-            master.names[number] = f"{self._first_parts[strip]}-M{self._numbers[strip]}"
-        return master.names[number]
-
-    def _look(self, master: _Master, view: _StripView, p: _PairPrediction) -> list[MatchedTie]:
-        """Look for the places of a master in a view; the ties and later looks that follow."""
-        pair = master.view, view
-        share = master.view.ground_share
-        looks = LookMatcher(p, lambda index, scan, travel: pair[index].image(scan, travel / share), 0)
-        numbers = np.flatnonzero(p.seen(master.places))
-        if not self._found(looks, p, pair, [Track(master.places[number], 1) for number in numbers.tolist()]):
-            self.counters["ground not found"] += len(numbers)
-            return []
-        numbers = np.flatnonzero(p.seen(master.places))  # the ground may have been found at another height
-        tracks = {number: Track(master.places[number], 1) for number in numbers.tolist()}
-        out: list[MatchedTie] = []
-        waiting: list[tuple[int, Looked, int]] = []
-        for part in _batches(np.array([master.places[i].line for i in numbers]), numbers):
-            looks.look([tracks[i] for i in part], 0)
-            found = [i for i in part if tracks[i].found[0]]
-            looked = looks.finish([tracks[i] for i in found]) if found else None
-            if looked is not None:
-                waiting += [(number, looked, k) for k, number in enumerate(found)]
-                out += self._judged(master, view, p, waiting)
-        self.counters["too few looks"] += len(waiting)
-        self.counters.update(looks.counters)
-        return out
-
-    def _found(
-        self, looks: LookMatcher, p: _PairPrediction, pair: tuple[_StripView, _StripView], tracks: list[Track]
-    ) -> bool:
-        """Whether it is known how high the ground is, and where the view lies as far as searches reach; else look."""
-        if not self._heights.some:
-            return self._find_ground(looks, p, pair, tracks)
-        shifts = p.beside(along_too=True)
-        if len(shifts) == 1:
-            return True
-        some = _some(tracks)
-        for shift in shifts:
-            p.slow.suppose(shift[None], self.options.largest_reach_px / 3)
-            points = looks.try_height(some, 0, p.heights.prior_m)
-            if points is not None and len(points) >= max(LEAST_FOUND, SHARE * len(some)):
-                return True
-        p.slow.forget()
-        return False
-
-    def _find_ground(
-        self, looks: LookMatcher, p: _PairPrediction, pair: tuple[_StripView, _StripView], tracks: list[Track]
-    ) -> bool:
-        """Match some places as if the ground were at one height after another; whether it was found.
-
-        Attitudes may be so uncertain that a view lies beside where it is looked for by more than a search reaches: that
-        is tried too. Along the parallax it looks like a height.
-        """
-        if len(tracks) < LEAST_FOUND:
-            return False
-        some = _some(tracks)
-        prior, o = p.heights.prior_m, self.options
-        heights = self._heights_tried(p, [track.place for track in some]).tolist()
-        tried = [(height, beside, o.largest_reach_px) for beside in p.beside(along_too=False) for height in heights]
-        # a narrow search finds the ground in short strips too, where it is as high as it is thought to be
-        for height, beside, reach in [(prior, np.zeros(2), o.least_reach_px), *tried]:
-            p.slow.forget()
-            if beside.any():
-                p.slow.suppose(beside[None], reach / 3)
-            points = looks.try_height(some, 0, height, reach)
-            if points is None or len(points) < max(LEAST_FOUND, SHARE * len(some)):
-                continue
-            p.heights.found(points)
-            p.heights_changed()
-            if abs(p.heights.prior_m - prior) > 3 * p.heights.prior_sigma_m:
-                found = f"the ground was found at about {p.heights.prior_m:.0f} m above the origin"
-                self._events.append(f"{found}, not at {prior:.0f} m")
-            return True
-        p.slow.forget()
-        return False
-
-    def _heights_tried(self, p: _PairPrediction, places: list[Place]) -> Array:
-        """Heights of the ground, the likeliest first; a search at one of them reaches to the next."""
-        sine = np.sin(p.angle(places))
-        pixel = p.height_and_travel()[0] * p.views[0].pitch_mm / p.views[0].focal_length_mm
-        step = 2 * (1 - OVERLAP) * self.options.largest_reach_px * pixel / max(float(sine), 1e-3)
-        prior, low = p.heights.prior_m, min(p.heights.lowest_m, p.heights.prior_m)
-        high = min(HIGHEST_GROUND_M, p.platform_m - LEAST_ABOVE * (p.platform_m - low))
-        below, higher = (int(np.ceil(max(reach, 0.0) / step)) for reach in (prior - low, high - prior))
-        steps = np.arange(-below, higher + 1)
-        return prior + step * steps[np.argsort(np.abs(steps), kind="stable")]
-
-    def _judged(
-        self, master: _Master, view: _StripView, p: Prediction, waiting: list[tuple[int, Looked, int]]
-    ) -> list[MatchedTie]:
-        """Looks that agree with their neighbours become ties; while there are too few to tell, they wait."""
-        parts = [looked.disagreement.select([k]) for _, looked, k in waiting]
-        together = Disagreement(
-            *(np.concatenate([getattr(d, a) for d in parts]) for a in ("time_s", "across", "residual"))
-        )
-        good = p.slow.judge(together)
-        if good is None:
-            return []
-        fine = good[:, 0]
-        self.counters["contradiction"] += int((~fine).sum())
-        out: list[MatchedTie] = []
-        for (number, looked, k), ok, left in zip(waiting, fine, together.residual[:, 0], strict=True):
-            if not ok:
-                continue
-            known = number in master.names
-            rays = [replace(ray, strip=v.strip.id) for ray, v in zip(looked.rays[k], (master.view, view), strict=True)]
-            score, off = float(looked.score[k]), float(np.hypot(*left))
-            rays = rays[1:] if known else rays
-            out.append(MatchedTie(self._named(master, number), tuple(rays), score, looked.xyz_l[k], off, known))
-        places = [looked.xyz_l[k] for (_, looked, k), ok in zip(waiting, fine, strict=True) if ok]
-        p.heights.add(np.reshape(places, (-1, 3)))
-        self.counters["ties"] += sum(not tie.again for tie in out)
-        self.counters["later looks"] += sum(tie.again for tie in out)
-        waiting.clear()
-        return out
+        tried, empty = chooser.tried, chooser.empty
+        places = chooser.choose(ring, view.strip.times.rate, ring.start, view.lines.saturated)
+        self.counters["places"] += chooser.tried - tried
+        self.counters["cells without texture"] += chooser.empty - empty
+        return places
 
 
-def _some(tracks: list[Track]) -> list[Track]:
-    """A few of the places, evenly; those at the ends, about which lines may be missing, are left out."""
-    inner = tracks[len(tracks) // 5 : len(tracks) - len(tracks) // 5]
-    return [inner[i] for i in np.linspace(0, len(inner) - 1, min(TOGETHER, len(inner))).astype(int)]
-
-
-def _batches(line: Array, number: NDArray[np.intp]) -> list[list[int]]:
-    """Places that are matched together: first some in the middle of a strip, whose wide search has lines all around."""
-    if not len(line):
-        return []
-    nearest = np.argsort(np.abs(line - 0.5 * (line.min() + line.max())), kind="stable")
-    first, rest = nearest[:TOGETHER], np.sort(nearest[TOGETHER:])
-    parts = [first, *(rest[begin : begin + BATCH] for begin in range(0, len(rest), BATCH))]
-    return [number[part].tolist() for part in parts]
+def _band(sample: Array, pixels: int) -> NDArray[np.intp]:
+    """The band across the image (n,) of samples (n,)."""
+    return np.clip(sample / pixels * BANDS, 0, BANDS - 1).astype(np.intp)

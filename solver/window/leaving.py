@@ -31,8 +31,8 @@ MOST_LEAVING = 1000
 #: at once.
 LEAVING_S, LEAST_LEAVING = 1.0, 100
 #: So long after the end of a strip of a camera with one view, s, its first looks are waited for, and so much of the
-#: strip, s, stays for them. Tuned: the first is time for a matcher to go through a strip, the second bounds the work of
-#: an update.
+#: strip, s, stays for them. Tuned: the first is time for a program that matches whole strips, the second bounds the
+#: work of an update.
 AWAITED_S, MOST_AWAITED_S = 30.0, 180.0
 #: Steps kept for the backward pass of a strip too long for a block; of one that never ends the earliest part is not
 #: refined again.

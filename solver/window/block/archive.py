@@ -41,9 +41,9 @@ MOST_OF_STRIP = 2800
 PRIOR_TOGETHER = 120
 #: Cost of refining a second or so of orientation, and the points of a batch, in floating point operations, about.
 REFINED_ORIENTATION, REFINED_POINTS = 4e7, 8e6
-#: Object points kept, beyond which the oldest strip is refined no more, and single looks kept beside them, beyond which
-#: the oldest are forgotten. They bound the memory. Tuned.
-MOST_POINTS, MOST_SINGLE = 30000, 1500
+#: Object points kept, beyond which the oldest strip is refined no more, and single looks kept beside them, which are
+#: thinned out beyond that. They bound the memory: a single look takes 20 kB. Tuned.
+MOST_POINTS, MOST_SINGLE = 30000, 6000
 #: Condition number of its normal matrix up to which a point counts as placed; rounding spoils what is beyond.
 PLACED = 1e12
 
@@ -209,10 +209,12 @@ class Archive:
     def linearise_single(self, solution: BlockSolution) -> Parts:
         """Linearise single looks at a solution, so that the ties to them in the window are as good as it; in parts.
 
-        Of too many the oldest are forgotten.
+        Of too many some are forgotten, evenly, so that those of each strip are left to strips that cross it later.
         """
         names = [name for name, kept in self.points.items() if kept.single is not None]
-        for name in names[: max(len(names) - MOST_SINGLE, 0)]:
+        share = min(MOST_SINGLE / max(len(names), 1), 1.0)
+        stays = np.diff(np.floor(share * np.arange(len(names) + 1) + 0.5)) > 0
+        for name in (names[i] for i in np.flatnonzero(~stays)):
             del self.points[name]
         done: set[int] = set()
         for kept in self.points.values():

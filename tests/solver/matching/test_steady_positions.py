@@ -106,7 +106,7 @@ def test_motion_is_kept_to_millimetres_and_gaps_are_left_alone():
 
 
 def test_it_costs_no_more_as_the_flight_goes_on():
-    steady = SteadyPositions()
+    steady = SteadyPositions(120.0)
     for i in range(40_000):
         steady.add(i / RATE_HZ, np.zeros(3))
     assert len(steady._knots) <= 1201 and len(steady._time) <= 4096
