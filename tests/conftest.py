@@ -6,6 +6,11 @@ import sys
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# glibc gives arrays of 128 kB and more back to the kernel as they go, which hands out zeroed pages for the next ones: a
+# twentieth of all time. Workers of pytest-xdist and programs that tests start keep them.
+os.environ.setdefault("MALLOC_MMAP_THRESHOLD_", str(32 << 20))
+os.environ.setdefault("MALLOC_TRIM_THRESHOLD_", str(256 << 20))
+
 # Tests start some two hundred programs. Where the environment forbids byte code (images of containers do), each of
 # them would compile the package anew, and each worker of pytest-xdist would rewrite the assertions of all tests.
 sys.dont_write_bytecode = False
