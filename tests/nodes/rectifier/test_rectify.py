@@ -43,6 +43,7 @@ from triline.solver.simulation.road_check import find_roads
 #: A rough flight: roads are off by several pixels with the measured orientation.
 SETTINGS = {
     "sensor": "ads40-small", "pixels": 800, "images": True, "seconds": 20.0, "ties": 12.0, "turbulence": 3.0,
+    "lead_in": 3.0,
     "wander_attitude": (0.3,) * 3, "wander": (3.0,) * 3, "attitude_rate": 100.0,
     "control": 6, "check": 4, "cars": 0.0, "seed": 4,
 }  # fmt: skip
