@@ -29,7 +29,7 @@ from .options import MatchedRay, MatchedTie, MatchingOptions, Place, first_part_
 from .places import PlaceChooser
 from .round_earth import RoundHeights
 from .search import LEAST_SQUARES_HALF
-from .strip_pair import Master, StripPair
+from .strip_pair import Master, StripPair, lone_sigma_px
 
 Array = NDArray[np.floating]
 
@@ -40,8 +40,6 @@ POSES_KEPT = 512
 #: A view is steeper than another if it looks down more steeply by this, rad. Tuned: two lenses that look forward and
 #: backward alike count as equal.
 STEEPER = np.radians(2.0)
-#: Standard deviation of a place before anything is matched with it, px: half of what it may be at most. Tuned.
-LONE_SIGMA_PX = 0.05
 #: Bands across the image in which places are chosen or not: none where the lines see so large a share of as many places
 #: of other strips. Tuned.
 BANDS, ENOUGH_SEEN = 16, 0.5
@@ -277,9 +275,9 @@ class StripMatcher:
         """
         master = next((m for m in self._masters if m.view is view), None)
         if master is None:
-            master = Master(view, self._first_parts[view.strip.id])
+            master = Master(view, self._first_parts[view.strip.id], told_px=lone_sigma_px(self.options))
             self._masters.append(master)
-        chosen = self._chosen(view)
+        chosen, sigma_px = self._chosen(view), master.told_px
         # each of them is a point at once, so that no more are needed than points are wanted
         view.chooser.density.judged(
             np.array([2 * p.sample / view.view.pixels - 1 for p in chosen]), np.ones(len(chosen), dtype=bool)
@@ -289,9 +287,7 @@ class StripMatcher:
         out = []
         for place in (p for p, b in zip(chosen, band, strict=True) if not enough[b]):
             master.places.append(place)
-            ray = MatchedRay(
-                view.view.ccd, place.line, place.sample, LONE_SIGMA_PX, LONE_SIGMA_PX, view.strip.id
-            )  # fmt: skip
+            ray = MatchedRay(view.view.ccd, place.line, place.sample, sigma_px, sigma_px, view.strip.id)
             out.append(MatchedTie(master.point(len(master.places) - 1), (ray,), 1.0, np.full(3, np.nan), 0.0))
         return out
 

@@ -13,7 +13,7 @@ from .ground_search import LEAST_FOUND, SHARE, TOGETHER
 from .kept_strip import StripView
 from .line_scan import LineScan
 from .looks import Looked, LookMatcher, Track
-from .options import MatchedTie, MatchingOptions, Place
+from .options import MatchedRay, MatchedTie, MatchingOptions, Place
 from .pair_prediction import PairPrediction
 from .prediction import PAD, WIDE
 from .round_earth import RoundHeights
@@ -21,6 +21,15 @@ from .search import LEAST_SQUARES_HALF, MARGIN, TurnedImage
 from .waiting import BATCH
 
 Array = NDArray[np.floating]
+
+#: Sigma of a match, px, as it is without the floor. Tuned: the median of simulated ones.
+MATCH_SIGMA_PX = 0.03
+
+
+def lone_sigma_px(options: MatchingOptions) -> float:
+    """Standard deviation of the line and the sample of a place before anything is matched with it, px: half of the
+    variance of a usual match, of which the other half is that of the later look."""
+    return float(np.sqrt(0.5 * (MATCH_SIGMA_PX**2 + options.image_sigma_px**2)))
 
 
 @dataclass(eq=False)
@@ -33,12 +42,14 @@ class Master:
     name : first part of the names of its points
     places : as they were chosen; more come while its strip is taken
     names : of places that are points, by their number
+    told_px : sigma of their lines and samples, px, where they are told before they are matched; else infinity
     """
 
     view: StripView
     name: str
     places: list[Place] = field(default_factory=list)
     names: dict[int, str] = field(default_factory=dict)
+    told_px: float = np.inf
 
     def point(self, number: int) -> str:
         """The name of a place, from now on a point."""
@@ -160,7 +171,7 @@ class StripPair:
             known = number in self.master.names
             rays = tuple(replace(ray, strip=id) for ray, id in zip(looked.rays[k], strips, strict=True))
             score, off = float(looked.score[k]), float(np.hypot(*left))
-            rays = rays[1:] if known else rays
+            rays = self._later(*rays) if known else rays
             out.append(MatchedTie(self.master.point(number), rays, score, looked.xyz_l[k], off, known))
         places = [looked.xyz_l[k] for (_, looked, k), ok in zip(waiting, fine, strict=True) if ok]
         p.heights.add(np.reshape(places, (-1, 3)))
@@ -168,6 +179,14 @@ class StripPair:
         self.counters["later looks"] += sum(tie.again for tie in out)
         waiting.clear()
         return out
+
+    def _later(self, place: MatchedRay, look: MatchedRay) -> tuple[MatchedRay]:
+        """The later look alone, with the variance of the match that its place was not told to have."""
+        more = max(place.sigma_line, place.sigma_sample) ** 2 - self.master.told_px**2
+        if more <= 0.0:
+            return (look,)
+        line, sample = (float(np.sqrt(sigma**2 + more)) for sigma in (look.sigma_line, look.sigma_sample))
+        return (replace(look, sigma_line=line, sigma_sample=sample),)
 
     # -- where the view lies, and the ground ---------------------------------------------------------------------------
 
