@@ -275,6 +275,7 @@ def read_flight(folder: Path, live: bool | None = None, instead: Instead | None 
     ids = [id for id, _, _ in flight.announced] if live else [strip.id for strip in flight.strips]
     for id in sorted({id for id in ids if ids.count(id) > 1}):
         flight.problems.append(f"{path}: strips: {id!r} comes twice, wanted another id for each strip")
+    flight.notes.extend(_at_once(flight.strips))
     for name in tables["nodes"].values:
         flight.attempt(lambda name=name: _node(tables["nodes"], name))
     for keys in (file, *tables.values(), *(strips or [])):
@@ -282,6 +283,20 @@ def read_flight(folder: Path, live: bool | None = None, instead: Instead | None 
         unknown = [key for key in keys.values if key not in known]
         flight.problems.extend(f"{path}: {keys.name(key)}: not known, wanted {', '.join(known)}" for key in unknown)
     return flight
+
+
+def _at_once(strips: list[ImageStrip]) -> list[str]:
+    """A note for each strip whose lines were imaged while those of another one were."""
+    notes, before = [], None
+    for strip in sorted(strips, key=lambda strip: int(strip.time_ns[0])):
+        if before is not None and strip.time_ns[0] <= before.time_ns[-1]:
+            notes.append(
+                f"{FILE}: strips {before.id} and {strip.id} are imaged at the same time: of one camera a time is "
+                "wrong; cameras that look at once want a folder each, since lines of one strip at a time are matched"
+            )
+        if before is None or strip.time_ns[-1] > before.time_ns[-1]:
+            before = strip
+    return notes
 
 
 def refuse_problems(flight: Flight) -> None:

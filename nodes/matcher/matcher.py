@@ -21,6 +21,7 @@ from ..governor import Announced, Governor
 from ..node import Message, Node
 from .found_strips import FoundStrips
 from .pace import PARTS, WINDOW_S, MatcherPace
+from .side_by_side import SideBySide
 from .strip_clock import StripClock
 from .targets import DoubtfulTargets
 
@@ -128,6 +129,7 @@ class Matcher(Node):
         self._strips: dict[str, Any] = {}
         self._times: dict[str, LineTimes] = {}
         self._found = FoundStrips()
+        self._flown = SideBySide()
         self._reference_ns = 0
         self._stamp_ns = self._told_ns = 0
         self._filtered_seen = False
@@ -354,16 +356,27 @@ class Matcher(Node):
         times = self._clock(strip).times
         if block.line_times_ns is not None:
             times.add(int(block.first_line), (block.line_times_ns - self._reference_ns) * 1e-9)
+        one_by_one = isinstance(matcher, TieMatcher)
+        beside, other = self._flown.lines(block, self._stamp_ns, self._strips)
+        if other and (one_by_one or self._targets.some):
+            what = "they are left out" if one_by_one else "targets are not looked for in them"
+            out.append(self._log(f"{other}: {what}; cameras that look at once want a recording each", warning=True))
+        if beside and one_by_one:
+            self.counters["lines beside another strip"] += len(block.pixels)
+            return out
         if matcher.strip != strip.id:
             out += [self._log(text, warning=True) for text in self._strip_over()]
             matcher.begin_strip(strip.id, times, int(block.first_line))
-            self._targets.begin_strip(self._clock(strip), matcher.orientation)
             self._failed, self._ground_unknown = 0, matcher.ground_m is None
+        if self._targets.strip != strip.id and not beside:
+            self._targets.begin_strip(self._clock(strip), matcher.orientation)
         if self._pace.blind:
             self.counters["lines gone by"] += len(block.pixels)
             return out
         usable = matcher.add_lines(ccd, int(block.first_line), block.pixels)
         out += self._ties(matcher.match(), strip.id)
+        if beside:
+            return out
         targets, words = self._targets.lines(ccd, int(block.first_line), block.pixels, self._observed_ns, usable)
         out += targets
         out += [self._log(f"{strip.id}: {text}", warning=True) for text in words]

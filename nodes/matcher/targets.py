@@ -37,6 +37,16 @@ class DoubtfulTargets:
         self._verdict: dict[str, bool] = {}
         self._held: dict[str, list[tuple[StripClock, TargetLook]]] = {}
 
+    @property
+    def some(self) -> bool:
+        """Whether any point is signalised."""
+        return bool(self._points)
+
+    @property
+    def strip(self) -> str:
+        """The strip that lines belong to, empty before the first one."""
+        return "" if self._strip is None else self._strip.strip.id
+
     def configure(self, camera: LineCamera, orientation: CurrentOrientation) -> None:
         """Begin (again) with a camera; ``orientation`` is kept up to date by the caller."""
         self._finder = TargetFinder(camera, orientation, self.options)

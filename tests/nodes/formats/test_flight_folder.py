@@ -122,6 +122,14 @@ def test_a_folder_becomes_a_recording(folder, tmp_path, capsys):
     assert load(folder / "flight.toml", ["matcher"]) == {"matcher": {"image_sigma_px": 0.04, "ground_m": 5.0}}
 
 
+def test_strips_that_are_imaged_at_the_same_time_are_told(folder, capsys):
+    """A time taken over from another strip, or a second camera: nothing said why the matcher found no tie point."""
+    (folder / "flight.toml").write_text(TOML.replace("12:00:03Z", "12:00:00.5Z"))
+    assert main(["check", str(folder)]) == 0
+    (told,) = [line for line in capsys.readouterr().out.splitlines() if "at the same time" in line]
+    assert "strips S1 and S2 are imaged at the same time" in told
+
+
 def test_the_origin_lies_on_the_ground_by_raster_or_height_above_it(folder, tmp_path, capsys):
     place = rasterio.Affine(0.002, 0, LON - 0.1, 0, -0.002, LAT + 0.1)
     with rasterio.open(

@@ -12,6 +12,7 @@ from driven_flight import SETTINGS
 from triline.nodes.convert import camera_message
 from triline.nodes.matcher.found_strips import FoundStrips
 from triline.nodes.matcher.matcher import Matcher
+from triline.nodes.matcher.side_by_side import SideBySide
 from triline.nodes.navigator.navigator import Navigator
 from triline.nodes.node import Message
 from triline.nodes.rectifier.rectifier import Rectifier
@@ -55,6 +56,24 @@ def test_a_strip_ends_with_another_one_or_with_silence():
     found.note(block("S2", 0), EPOCH_NS)
     (ended,) = found.ended(EPOCH_NS + 6_000_000_000)
     assert (ended.id, ended.lines) == ("S2", 20) and found.finish() == []
+
+
+def test_of_strips_at_once_the_first_one_is_flown():
+    strips = {id: m.Strip(id=id) for id in ("S1", "S2", "T1")}
+    flown = SideBySide()
+
+    def at(strip, seconds, stamp_s=None):
+        of = replace(block(strip, 0), time_ns=EPOCH_NS + round(seconds * 1e9))
+        return flown.lines(of, EPOCH_NS + round((seconds if stamp_s is None else stamp_s) * 1e9), strips)
+
+    assert at("S1", 0.0) == at("T1", 0.1) == (False, "")
+    assert at("S1", 0.2) == (False, "T1: its lines come beside those of S1")
+    assert at("T1", 0.3) == at("T1", 0.9) == (True, "") and at("S1", 1.0) == (False, "")
+    assert at("T1", 6.1) == (False, "")  # S1 has fallen silent
+    assert at("S2", 7.0) == (False, "") and at("T1", 6.9, stamp_s=7.1) == (True, "")  # late, not at once
+    assert at("S2", 7.2) == (False, "")
+    strips["S2"].ended = True
+    assert at("S1", 7.3) == (False, "") and at("S1", 7.4) == (False, "")  # flown again, as in a loop
 
 
 def test_lines_that_are_off_the_rate_are_told_once():

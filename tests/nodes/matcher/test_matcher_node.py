@@ -1,5 +1,6 @@
 """The matcher among real nodes: bad imagery, several strips, a window that asks for more or less."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -226,6 +227,39 @@ def test_what_the_adjuster_answers_is_no_progress():
         if x.topic == "observation/progress"
     ]
     assert told == ["trajectory/filtered", "sensor/lines/N"]
+
+
+# ---- two strips at once
+
+
+def test_lines_of_a_second_camera_leave_the_strip_that_began_first_as_it_is(tmp_path, short):
+    """With each block of another strip matching began anew: no tie point, no target, and nothing said so."""
+
+    def second():
+        """Another camera's strip, by every second block of the nadir line."""
+        for strip in (x for x in short if x.topic == "configuration/strip"):
+            body = m.Strip()
+            body.CopyFrom(strip.body)
+            body.id = "T1"
+            yield replace(strip, body=body)
+        blocks = [x for x in short if x.topic == "sensor/lines/N"]
+        for x in blocks[1::2]:
+            yield replace(x, body=replace(x.body, strip="T1"))
+
+    (tmp_path / "alone").mkdir()
+    _, alone, _ = run(tmp_path / "alone", short)
+    numbers = Counter()
+    both = sorted([*short, *second()], key=lambda x: x.stamp_ns)
+    for k, x in enumerate(both):
+        both[k] = replace(x, sequence=numbers[x.topic])
+        numbers[x.topic] += 1
+    summary, ties, told = run(tmp_path, both)
+    assert len(ties) > 0.8 * len(alone) > 20
+    assert {image.strip for tie in ties for image in tie.images} == {"S1"}
+    (said,) = [text for text in told if "beside" in text]
+    assert said.startswith("T1: its lines come beside those of S1: they are left out")
+    assert summary.counters["matcher"]["lines beside another strip"] > 200
+    assert summary.counters["matcher"]["target measured"] > 5
 
 
 # ---- ground far from the origin's height
