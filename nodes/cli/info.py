@@ -13,7 +13,7 @@ from ..formats.json_text import json_text
 from ..recording.access import Recording
 from ..recording.remote import path_of
 from ..recording.seal_place import seal_of
-from ..recording.summary import findings, holdings
+from ..recording.summary import findings, holdings, platforms
 from ..terminal import plain
 
 EXAMPLE = "triline info flight.mcap"
@@ -51,7 +51,7 @@ def _summary(recording: Recording) -> dict[str, Any]:
         "library": reader.library,
         "messages": held.messages,
         "chunks": reader.n_chunks,
-        "platforms": sorted({channel.platform for channel in reader.channels.values() if channel.platform}),
+        "platforms": platforms(reader),
         "start": iso(span[0]) if span else None,
         "end": iso(span[1]) if span else None,
         "duration_s": held.duration_s,

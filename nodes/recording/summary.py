@@ -133,9 +133,21 @@ def holdings(reader: RecordingReader) -> Holdings:
     )  # fmt: skip
 
 
+def platforms(reader: RecordingReader) -> list[str]:
+    """Names of the platforms whose messages are in a recording."""
+    return sorted({channel.platform for channel in reader.channels.values() if channel.platform})
+
+
+def _several_platforms(reader: RecordingReader) -> list[str]:
+    """A line where a file holds more than one flight, as one that a tool for MCAP files has merged; nodes do not tell
+    their messages apart."""
+    names = platforms(reader)
+    return [f"messages of platforms {', '.join(names)} in one file, wanted one for each"] if len(names) > 1 else []
+
+
 def damage_lines(reader: RecordingReader) -> list[str]:
     """What of a recording cannot be read or used, in words; the messages are judged as far as they were decoded."""
-    lines = []
+    lines = _several_platforms(reader)
     if reader.damage:
         n, lost, first = len(reader.damage), sum(d.length for d in reader.damage), reader.damage[0]
         several = f"{n} damaged places ({lost} bytes); the first: {first}"
@@ -163,6 +175,7 @@ def findings(reader: RecordingReader, *, decode: bool = True, outside: bool = Tr
     if not any(channel.known for channel in reader.channels.values()):
         held = ", ".join(sorted({channel.topic for channel in reader.channels.values()})[:3])
         found.append(f"foreign: no topic of triline in it{', only ' + held if held else ''}")
+    found += _several_platforms(reader)
     if reader.problems["without a channel"]:
         found.append(f"{reader.problems['without a channel']} messages without a channel")
     for row in topic_summaries(reader):

@@ -115,6 +115,20 @@ def test_check_names_gaps(capsys, tmp_path):
     assert code == 1 and "sensor/gnss: 3 messages missing by their numbers" in err
 
 
+def test_a_file_with_the_flights_of_two_aircraft_is_told(capsys, tmp_path):
+    """Tools for MCAP files merge any; nodes took both for one flight, and only duplicates were told."""
+    both = tmp_path / "both.mcap"
+    with RecordingWriter(both, platform="a1") as writer:
+        for platform, source in (("a1", "receiver"), ("b1", "other")):
+            for k in range(3):
+                data, envelope = codec.encode(sample.body("sensor/gnss", k)), Envelope(sample.EPOCH_NS + k, source, k)
+                writer.write_raw(RawMessage("sensor/gnss", envelope, data, 1), platform)
+    wanted = "messages of platforms a1, b1 in one file, wanted one for each"
+    code, _, err = run(capsys, "check", both)
+    assert code == 1 and wanted in err
+    assert run(capsys, "info", both)[1].count(wanted) == 1
+
+
 def test_recover(capsys, flight, tmp_path):
     path, out_path = tmp_path / "cut.mcap", tmp_path / "whole.mcap"
     write_recording(tmp_path / "small.mcap", sample.flight(3.0, lines=True), chunk_size=8192)
