@@ -37,6 +37,7 @@ from .geocal_xml import read_glas_camera
 from .ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
 from .image_lines import ImageStrip, LinesGiven, open_strip
 from .keys import Keys, is_there, read_toml
+from .new_file import new_file
 from .projection import missing_grids, off_without_grids, unknown_heights, with_heights
 from .sensor_folder import SensorFolder, read_grade, read_sensor_folder, refuse_mounting
 from .sensor_recording import sensor_extent, some
@@ -849,5 +850,6 @@ def write_template(folder: Path) -> Path:
         raise UserError(f"{folder}: is a file, wanted a folder")
     folder.mkdir(parents=True, exist_ok=True)
     name = folder.resolve().name.replace("\\", "").replace('"', "")
-    path.write_text(TEMPLATE.format(name=name, kinds=", ".join(NAVIGATION)), encoding="utf-8")
+    with new_file(path) as part:
+        part.write_text(TEMPLATE.format(name=name, kinds=", ".join(NAVIGATION)), encoding="utf-8")
     return path

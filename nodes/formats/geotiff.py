@@ -5,6 +5,9 @@ Rasterio is imported where it is used: it takes half a second, and most commands
 
 from __future__ import annotations
 
+import errno
+import os
+import shutil
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -28,6 +31,8 @@ Array = NDArray[np.floating]
 BLOCK = 512
 #: Megabytes of blocks that GDAL holds while it makes a cloud-optimised file of tiles.
 CACHE_MB = 192
+#: A disk on which writing fails is full where fewer bytes are free.
+FULL = 1_000_000
 #: A raster of heights has no more cells than this.
 MOST_HEIGHTS = 100_000_000
 #: Names of the bands of a file of sigmas.
@@ -105,17 +110,15 @@ def write_heights(path: Path, heights: Heights) -> None:
     rows, columns = heights.z_m.shape
     corner = heights.x0 - 0.5 * heights.dx, heights.y0 - 0.5 * heights.dy
     transform = rasterio.Affine(heights.dx, 0.0, corner[0], 0.0, heights.dy, corner[1])
-    with (
-        new_file(path) as part,
-        _told(path),
-        rasterio.open(
+    with new_file(path) as part:
+        with _told(path), rasterio.open(
             part, "w", driver="GTiff", width=columns, height=rows, count=1, dtype="float32", crs=heights.crs,
             transform=transform, nodata=np.nan, compress="deflate", predictor=3, tiled=True,
-        ) as target,
-    ):  # fmt: skip
-        target.write(heights.z_m.astype(np.float32), 1)
-        if heights.above_ellipsoid:
-            target.update_tags(**{_DATUM: "ellipsoid"})
+        ) as target:  # fmt: skip
+            target.write(heights.z_m.astype(np.float32), 1)
+            if heights.above_ellipsoid:
+                target.update_tags(**{_DATUM: "ellipsoid"})
+        _refuse_cut(part, path)
 
 
 @dataclass(frozen=True)
@@ -218,6 +221,7 @@ def tiled_orthoimage(
                 if any(raster.units):
                     target.units = raster.units
                 yield Draft(path, target)
+            _refuse_cut(draft, path)
             if compress == "plain":
                 draft.replace(part)
                 return
@@ -226,6 +230,7 @@ def tiled_orthoimage(
                     draft, part, driver="COG", compress=compress, blocksize=BLOCK, bigtiff="if_safer",
                     overview_resampling=overview_resampling, num_threads="all_cpus", **predictor,
                 )  # fmt: skip
+            _refuse_cut(part, path)
         finally:
             draft.unlink(missing_ok=True)
 
@@ -272,6 +277,7 @@ def pieces_of_raster(path: Path, raster: Raster, block: int = BLOCK) -> Iterator
             for k, text in enumerate(raster.descriptions):
                 target.set_band_description(k + 1, text)
             yield Draft(path, target)
+        _refuse_cut(part, path)
 
 
 @dataclass(frozen=True)
@@ -370,16 +376,55 @@ def cloud_optimised(path: Path, source: Path, compress: str = "deflate", overvie
             source, part, driver="COG", compress=compress, blocksize=BLOCK, bigtiff="if_safer",
             overview_resampling=overview_resampling, num_threads="all_cpus", **predictor,
         )  # fmt: skip
+        _refuse_cut(part, path)
 
 
 @contextmanager
 def _told(path: Path) -> Iterator[None]:
+    from rasterio._err import CPLE_BaseError  # of GDAL itself, as copying raises them
     from rasterio.errors import RasterioError
 
     try:
         yield
-    except RasterioError as error:
-        raise UserError(f"{path}: cannot be written: {' '.join(str(error).split())}") from None
+    except (RasterioError, CPLE_BaseError) as error:
+        raise _not_written(path, " ".join(str(error.__cause__ or error).split())) from None
+
+
+def _not_written(path: Path, why: str) -> UserError:
+    """What is told where a file cannot be written; GDAL does not say that a disk is full."""
+    full = shutil.disk_usage(path.parent).free < FULL
+    return UserError(f"{path}: cannot be written: {os.strerror(errno.ENOSPC).lower() if full else why}")
+
+
+def _refuse_cut(part: Path, path: Path) -> None:
+    """Raise UserError where blocks of a new file lie beyond its end.
+
+    What GDAL cannot write any more when it closes a file, on a disk that is full, it leaves out without an error.
+    """
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning
+
+    size = part.stat().st_size
+    with warnings.catch_warnings(), _told(path):
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(part) as source:
+            whole = all(end <= size for end in _ends_of_blocks(source))
+    if not whole:
+        raise _not_written(path, "its end is missing")
+
+
+def _ends_of_blocks(source: Any) -> Iterator[int]:
+    """Where in the file each block of a GeoTIFF ends that is there, those of overviews, too."""
+    for band, (rows, columns) in zip(source.indexes, source.block_shapes, strict=True):
+        for level, factor in [(None, 1), *enumerate(source.overviews(band))]:
+            for row in range(-(-source.height // (factor * rows))):
+                for column in range(-(-source.width // (factor * columns))):
+                    place, size = (
+                        source.get_tag_item(f"BLOCK_{what}_{column}_{row}", "TIFF", bidx=band, ovr=level)
+                        for what in ("OFFSET", "SIZE")
+                    )
+                    if place is not None and size is not None:  # else it holds nothing
+                        yield int(place) + int(size)
 
 
 def write_orthoimage(

@@ -60,6 +60,7 @@ def new_file(target: Path) -> Iterator[Path]:
         of_part = error.errno in _FULL if error.filename is None else error.filename == os.fspath(part)
         if not of_part:
             raise
-        raise UserError(f"{target}: cannot be written: {(error.strerror or str(error)).lower()}") from None
+        why = os.strerror(error.errno) if error.errno in _FULL else error.strerror or str(error)
+        raise UserError(f"{target}: cannot be written: {why.lower()}") from None
     finally:
         part.unlink(missing_ok=True)

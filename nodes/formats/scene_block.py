@@ -35,6 +35,7 @@ from ...solver.scene_adjustment.rigorous import LensView, lens_view
 from ..errors import UserError
 from .block_folder import GROUND, known_points, trajectory_settings, unknown_settings
 from .keys import Keys, read_toml
+from .new_file import new_file
 from .projection import notes_of_heights
 from .satellite.read import read_scene
 from .satellite.scene import SatelliteScene
@@ -444,7 +445,8 @@ def write_scene_block(
         lines += [f"{key} = {json.dumps(value)}" for key, value in trajectory.items()]
     for scene, keys in scenes.items():
         lines += [f"[scenes.{json.dumps(scene)}]", *(f"{key} = {json.dumps(value)}" for key, value in keys.items())]
-    (folder / "project.toml").write_text("\n".join([*lines, ""]), encoding="utf-8")
+    with new_file(folder / "project.toml") as part:
+        part.write_text("\n".join([*lines, ""]), encoding="utf-8")
     known = KnownGround.none() if block is None else block.known
     ids = np.array(() if block is None else block.point_ids, dtype=object)
     ellipsoid = WGS84 if block is None else block.ellipsoid

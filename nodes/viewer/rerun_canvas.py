@@ -158,7 +158,7 @@ class RerunCanvas:
             self.stream.flush(timeout_sec=_FLUSH_S)
         except RuntimeError:  # the library does not say why
             if self.file is not None:
-                raise OSError(errno.EIO, "its writer has given up, as on a full disk", str(self.file)) from None
+                raise _given_up(self.file) from None
             if self.process is None:
                 raise
             if self.process.running:
@@ -167,12 +167,16 @@ class RerunCanvas:
         return True
 
 
+def _given_up(file: Path) -> OSError:
+    return OSError(errno.EIO, "its writer has given up, as on a full disk", str(file))
+
+
 def open_canvas(mode: str) -> Canvas:
     """A canvas by mode: ``native`` (a window), ``web`` (on the loopback interface), ``rrd:PATH`` (a file) or ``none``.
 
     Raises
     ------
-    UserError : the viewer cannot be started, or the file cannot be written
+    OSError, UserError : the viewer cannot be started, or the file cannot be written
     ValueError : an unknown mode
     """
     if mode == "none":
@@ -184,7 +188,10 @@ def open_canvas(mode: str) -> Canvas:
         path = Path(mode[4:])
         if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
             raise UserError(f"{path}: cannot be written there")
-        stream.save(path)
+        try:
+            stream.save(path)
+        except RuntimeError:  # the library does not say why
+            raise _given_up(path) from None
         return RerunCanvas(stream, file=path)
     process = ViewerProcess(web=mode == "web")
     stream.connect_grpc(process.grpc_url)

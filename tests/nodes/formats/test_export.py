@@ -112,13 +112,14 @@ def test_one_row_a_message_with_columns_named_as_the_fields(recording, tmp_path)
     assert table["velocity.x_m_s"].isna().all()  # a sub-message that was not sent
 
 
-@pytest.mark.parametrize("kind", ["csv", "geojson", "gpkg", "sbet"])
+@pytest.mark.parametrize("kind", ["csv", "geojson", "gpkg", "parquet", "sbet"])
 def test_a_full_disk_is_told_with_the_file_and_leaves_nothing(recording, tmp_path, capsys, kind):
     target = tmp_path / f"o.{kind}"
     with files_of_at_most(1000):
         assert main(["export", str(recording), "--topic", "orientation/final", f"--{kind}", str(target)]) == 1
     err = capsys.readouterr().err
     assert err.startswith(f"triline export: {target}: cannot be written: ") and err.count("\n") == 1
+    assert kind == "gpkg" or err.endswith(": file too large\n")
     assert not list(tmp_path.iterdir())
 
 
