@@ -162,7 +162,7 @@ def at_pace(tables: Tables, pace: str) -> Tables:
     if pace != "throughput":
         return tables
     rare = {"filtered_s": FILTERED_S, "smooth_every_s": SMOOTH_EVERY_S}
-    of_pace: Tables = {"navigator": rare, "adjuster": {"pace": "throughput"}}
+    of_pace: Tables = {"navigator": rare, "matcher": {"pace": "normal"}, "adjuster": {"pace": "throughput"}}
     return tables | {name: table | tables.get(name, {}) for name, table in of_pace.items()}
 
 

@@ -12,6 +12,8 @@ from recording_file import payloads
 from test_matcher_node import EPOCH_NS, SETTINGS, run
 
 from triline.nodes.bus.session import Bus
+from triline.nodes.cli.process import at_pace
+from triline.nodes.config import build
 from triline.nodes.matcher.matcher import Matcher
 from triline.nodes.matcher.pace import SHARES, MatcherPace
 from triline.nodes.node import Message
@@ -115,6 +117,18 @@ def test_a_pace_holds_from_its_time_on_and_levels_there_are_not_are_refused():
     assert said == ["2.4 s behind: 50 % of the tie points"]
     list(matcher.step(Message("matching/pace", 3_000, m.Pace(start_ns=4_000, level=len(SHARES)))))
     assert matcher.counters["malformed"] == 1 and "level 8" in matcher.last_problem
+
+
+def test_at_the_pace_for_throughput_the_load_in_flight_leaves_nothing_out():
+    """`process --pace throughput` of a flight under load left out the places that were left out in flight."""
+    shares = {}
+    for pace in ("load", "throughput"):
+        matcher = build(Matcher, at_pace({}, pace))
+        for topic, stamp in (("matching/pace", 1_000), ("trajectory/filtered", 3_000)):
+            body = MatcherPace(2, 2.4).message(2_000) if topic == "matching/pace" else m.PoseInFrame()
+            list(matcher.step(Message(topic, stamp, body)))
+        shares[pace] = matcher._pace.share
+    assert shares == {"load": 0.5, "throughput": 1.0}
 
 
 def test_fewer_places_keep_their_spread_and_those_of_earlier_strips_stay():
