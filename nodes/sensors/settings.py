@@ -52,7 +52,8 @@ class SensorProgram:
 def read_sensors(flight: Flight) -> list[SensorProgram]:
     """The programs that a flight folder names; what is wrong with a table goes to the problems of the flight.
 
-    ROS topics of images in several tables, which make strips of their own, are noted.
+    ROS topics of images in several tables, which make strips of their own, are noted, and cameras that make strips at
+    the same time.
     """
     programs: list[SensorProgram] = []
     for keys in flight.sensors:
@@ -70,6 +71,12 @@ def read_sensors(flight: Flight) -> list[SensorProgram]:
         flight.notes.append(
             f"{FILE}: [[sensor]] {', '.join(cameras)}: image topics in {len(cameras)} tables make separate strips; "
             "those of one camera belong in one table"
+        )
+    lines = [program for program in programs if program.node == "lines"]
+    if len({(program.settings.get("strip"), program.settings.get("line_rate_hz")) for program in lines}) > 1:
+        flight.notes.append(
+            f"{FILE}: [[sensor]] {', '.join(program.id for program in lines)}: strips or line rates of their own: of "
+            "strips that are imaged at the same time the matcher ties the one that began first"
         )
     return programs
 

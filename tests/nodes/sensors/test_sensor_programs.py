@@ -98,6 +98,16 @@ def test_image_topics_in_several_tables_are_told(folder, capsys):
     ]
 
 
+def test_cameras_with_strips_of_their_own_are_told(folder, capsys):
+    table = '[[sensor]]\nkind = "lines"\nid = "cam-{0}"\nimages = {{{0} = "{0}.bil"}}\nsamples = 7\n{1}\n'
+    rest = "first_time = 2026-11-22T10:10:00Z\nline_rate_hz = 100"
+    for other, told in ((rest, 0), (f'{rest}\nstrip = "T1"', 1), (rest.replace("100", "50"), 1)):
+        text = TOML.partition("[[sensor]]")[0] + table.format("F", rest) + table.format("N", other)
+        (folder / "flight.toml").write_text(text)
+        assert main(["check", str(folder)]) == 0
+        assert capsys.readouterr().out.count("[[sensor]] cam-F, cam-N: strips or line rates of their own") == told
+
+
 def test_what_is_published_before_a_live_flight(folder):
     flight = read_flight(folder)
     messages = live_configuration(flight, (48.0, 9.0), T, "flight")
