@@ -145,6 +145,7 @@ class TargetFinder:
         self._rings: dict[str, LineRing] = {}
         self._open: set[tuple[str, str]] = set()
         self._times: LineTimes | None = None
+        self._wait_s = WAIT_S  # so long after their lines targets are looked for
 
     def set_target(self, target: Target) -> None:
         """Add a target, or change its coordinates.
@@ -163,7 +164,10 @@ class TargetFinder:
     def begin_strip(self, times: LineTimes) -> None:
         """Lines that follow belong to a new strip, with their times; all targets may appear in it."""
         self._times = times
-        lines = int(WAIT_S * times.rate + 2 * self.options.largest_reach_px) + 8 * PAD
+        around = self.options.largest_reach_px + 4 * PAD  # of the widest search, on either side
+        lines = int(WAIT_S * times.rate + 2 * around)
+        # few lines a second take long to come
+        self._wait_s = max(WAIT_S, 0.5 * WAIT_S + around / times.rate)
         self._rings = {}
         self._capacity = lines
         self._open = {(name, ccd) for name in self._targets for ccd in self.views}
@@ -228,7 +232,9 @@ class TargetFinder:
         above = position[1, 2] - points[:, 2]
         swath = above * float(np.ptp(view.y_mm)) / view.focal_length_mm
         return [
-            n for n, b, a, s in zip(names, behind_s, aside, swath, strict=True) if -HORIZON_S < b < WAIT_S and a < s
+            n
+            for n, b, a, s in zip(names, behind_s, aside, swath, strict=True)
+            if -HORIZON_S < b < self._wait_s and a < s
         ]
 
     def _look(self, target: Target, scan: LineScan, ring: LineRing) -> TargetLook | None:

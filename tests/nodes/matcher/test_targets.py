@@ -155,6 +155,19 @@ def test_targets_are_measured_within_a_tenth_of_a_pixel_and_say_how_well(flown, 
     assert 0.25 < np.mean((off / sigma) ** 2) < 1.3
 
 
+def test_targets_are_measured_where_few_lines_come_in_a_second():
+    """Below 20 lines a second, those about a target came after the time in which targets were looked for."""
+    flown = simulated_flight(FLIGHT | {"height": 4000.0, "speed": 60.0, "pixels": 300, "seconds": 60.0, "check": 0})
+    strip = flown.simulation.flight.strips[0]
+    assert 5.0 < strip.line_rate_hz < 10.0
+    names, places = signalised(flown)
+    true = {look: at for look, at in true_looks(flown, names, places).items() if 50 < at[0] < strip.lines - 50}
+    looks = {(x.target, x.ccd): x for x in looks_at(flown, rendered(flown), names, places) if not x.reason}
+    assert len(true) > 4 and set(true) <= set(looks)
+    off, _ = errors_of(looks.values(), true_looks(flown, names, places))
+    assert np.hypot(*off.T).max() < 0.1
+
+
 @pytest.mark.study
 def test_on_an_unstabilised_mount_they_are_measured_as_well():
     flown = simulated_flight(FLIGHT | {"unstabilised": True, "seconds": 14.0, "seed": 5})
