@@ -39,6 +39,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "recover": ("recover", "a valid recording from a broken one, or from the parts of a flight"),
     "export": ("export", "topics to CSV, Parquet, GeoJSON/GeoPackage, SBET"),
     "import": ("import_", "flight folder, poses, sensors, image lines and others to a recording"),
+    "match": ("match", "tie points between the images of a block of satellite scenes"),
     "locate": ("locate", "pixels to the ground and back, by any sensor or RPC"),
     "rectify": ("rectify", "image lines to an orthoimage, a cloud-optimised GeoTIFF"),
     "study": ("study", "Monte Carlo and sensitivity studies"),

@@ -30,7 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     if args.what == "scenes":
-        path, todo = _new_scenes(args.folder, args.metadata), "ground_points.csv and image_points.csv want their rows"
+        path = _new_scenes(args.folder, args.metadata)
+        todo = "ground_points.csv and image_points.csv want their rows; `triline match` finds tie points in images"
     elif args.metadata:
         raise UserError(f"{args.metadata[0]}: metadata go with `triline new scenes`")
     else:

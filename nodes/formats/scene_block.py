@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +64,8 @@ _OUTSIDE_PX = 0.5
 #: Rows that cannot be used and are named one by one.
 _MOST_NAMED = 5
 
-_IMAGE = (
+#: Columns of image_points.csv.
+IMAGE = (
     Column("point", "text"),
     Column("strip", "text"),
     Column("ccd", "text", optional=True, blank=True),
@@ -85,6 +86,9 @@ class SceneEntry:
     scene : what the metadata hold
     model : one of `MODELS`
     camera : scenes that name the same share their additional parameters
+    images : names of the images by line of detectors, "" where the scene has one; none named where nothing is matched
+    band : of the images, a number, a name or a weighted sum ("2:0.5,3:0.5"); "" for all
+    first_pixel : column and row of the scene with which the images begin; None where nobody says
     """
 
     name: str
@@ -92,6 +96,9 @@ class SceneEntry:
     scene: SatelliteScene
     model: str
     camera: str
+    images: Mapping[str, str] = field(default_factory=dict)
+    band: str = ""
+    first_pixel: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -118,6 +125,11 @@ class ImageEntry:
         """Lines and samples, where they are known."""
         lines, samples = self.location.lines, self.location.samples
         return (lines, samples) if lines and samples else None
+
+    @property
+    def image(self) -> str:
+        """Name of its image as project.toml writes it, "" for none."""
+        return self.scene.images.get(self.ccd) or self.scene.images.get("", "")
 
 
 @dataclass(frozen=True)
@@ -250,7 +262,10 @@ def read_scene_block(folder: Path, with_lines: bool = False) -> SceneBlockData:
     images = _images(scenes)
     ellipsoid = _ellipsoid(folder, images)
     ground, frame = _ground(folder, crs, ellipsoid, notes)
-    image_table = read_table(folder / "image_points.csv", _IMAGE, notes, may_be_empty=with_lines)
+    if with_lines and not (folder / "image_points.csv").exists():
+        image_table = Table(folder / "image_points.csv", {c.name: np.empty(0) for c in IMAGE})
+    else:
+        image_table = read_table(folder / "image_points.csv", IMAGE, notes, may_be_empty=with_lines)
     ids, rays = _image_points(image_table, images, ground, sigma, notes)
     if not with_lines:
         used = np.unique(rays.image)
@@ -288,10 +303,32 @@ def _scenes(folder: Path, table: Keys, notes: list[str]) -> list[SceneEntry]:
         if model == "rpc" and scene.rpc is None:
             raise keys.refuse("model", f"another model: {metadata} has no rational polynomials")
         camera = keys.text("camera", scene.camera or name)
+        images, band, first = _images_of(keys, list(scene.sensors)), str(keys.raw("band", "")), None
+        if keys.has("first_pixel"):
+            column, row = keys.numbers("first_pixel", 2, low=0.0)
+            if (column, row) != (int(column), int(row)):
+                raise keys.refuse("first_pixel", "column and row, two integers")
+            first = int(column), int(row)
         notes.extend(f"scene {name}: {note}" for note in scene.notes)
         notes.extend(f"project.toml: key {key} is not known and was ignored" for key in keys.unread())
-        entries.append(SceneEntry(name, metadata, scene, model, camera))
+        entries.append(SceneEntry(name, metadata, scene, model, camera, images, band, first))
     return entries
+
+
+def _images_of(keys: Keys, lines: list[str]) -> dict[str, str]:
+    """Names of the images of a scene by its lines of detectors; one name where it has one line."""
+    if not keys.has("image"):
+        return {}
+    if not isinstance(keys.raw("image"), Mapping):
+        if len(lines) > 1:
+            raise keys.refuse("image", f"an image for each of the lines {', '.join(lines)}: {{ {lines[0]} = .. }}")
+        return {"": keys.text("image")}
+    table = keys.table("image")
+    for line in table.values:
+        if line not in lines:
+            wanted = f"one of the lines {', '.join(lines)}" if lines else "the name of an image: the scene has one line"
+            raise UserError(f"{table.path}: {table.name(line)}: wanted {wanted}")
+    return {line: table.text(line) for line in table.values}
 
 
 def _images(scenes: list[SceneEntry]) -> tuple[ImageEntry, ...]:

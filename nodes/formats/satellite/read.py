@@ -23,7 +23,8 @@ KINDS = {
     "folder": "folder of a scene (ephemeris.csv, attitude.csv, line_times.csv, camera.json)",
     "rpc": "RPC (DIMAP, .RPB, _RPC.TXT, .geom, tags of an image)",
 }
-_IMAGES = (".tif", ".tiff", ".jp2", ".ntf", ".nitf", ".img", ".vrt")
+#: Ends of names of images, whose tags may have polynomials.
+IMAGES = (".tif", ".tiff", ".jp2", ".ntf", ".nitf", ".img", ".vrt")
 
 
 def read_scene(path: Path) -> SatelliteScene:
@@ -46,7 +47,7 @@ def read_scene(path: Path) -> SatelliteScene:
     suffix = path.suffix.lower()
     with open(path, "rb") as file:
         head = text_start(file.read(512))
-    if suffix in _IMAGES:  # a virtual raster is XML, too
+    if suffix in IMAGES:  # a virtual raster is XML, too
         return SatelliteScene("rpc", None, read_rpc_tags(path))
     if head.startswith("<"):
         return _read_xml_scene(read_xml(path))
