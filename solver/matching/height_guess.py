@@ -63,9 +63,8 @@ class HeightGuess:
         """Heights (n,) and their sigma (n,) at places (n, 2)."""
         if not self.some:
             return np.full(len(xy), self.prior_m), np.full(len(xy), self.prior_sigma_m)
-        if self._tree is None:
-            self._tree = KDTree(self._points[:, :2])
-        d, near = self._tree.query(xy, k=min(NEIGHBOURS, len(self._points)))
+        tree = self._tree = self._tree or KDTree(self._points[:, :2])
+        d, near = tree.query(xy, k=min(NEIGHBOURS, len(self._points)))
         z = self._points[near, 2]
         w = 1.0 / (d + 1e-3 * d.max() + 1e-6) ** 2
         w /= w.sum(axis=1, keepdims=True)

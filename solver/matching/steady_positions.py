@@ -130,7 +130,8 @@ class SteadyPositions:
         """All positions about a knot have come."""
         at_s = number * POSITION_KNOT_S
         knot = self._knots[number] = self._fit(at_s)
-        self._knots.pop(number - self._kept, None)
+        if np.isfinite(self._kept):
+            self._knots.pop(number - int(self._kept), None)
         if knot is None:
             return
         i = int(np.searchsorted(self._time[: self._size], at_s))
