@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +27,9 @@ class Tiles:
     """Pieces of images that were read last."""
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[tuple[Path, int, int], NDArray[np.float32]] = OrderedDict()
+        self._kept: OrderedDict[Hashable, NDArray[np.float32]] = OrderedDict()
 
-    def get(self, key: tuple[Path, int, int], read: Callable[[], NDArray[np.float32]]) -> NDArray[np.float32]:
+    def get(self, key: Hashable, read: Callable[[], NDArray[np.float32]]) -> NDArray[np.float32]:
         """A piece, read where it is not among them."""
         if key in self._kept:
             self._kept.move_to_end(key)
@@ -53,6 +53,7 @@ class ScenePixels:
 
     def __init__(self, image: SourceImage, weights: dict[int, float], first: tuple[int, int], tiles: Tiles):
         self.image, self.weights, self.first, self._tiles = image, weights, first, tiles
+        self._name = image.path, tuple(weights.items())  # scenes may be bands of one file
         self.end = first[0] + image.lines, first[1] + image.samples
         kind = image.dtype
         plain = list(weights.values()) == [1.0] and kind.kind == "u" and kind.itemsize <= 2
@@ -68,7 +69,7 @@ class ScenePixels:
         )  # fmt: skip
         for row in range(low[0] // TILE, -(-high[0] // TILE)):
             for column in range(low[1] // TILE, -(-high[1] // TILE)):
-                tile = self._tiles.get((self.image.path, row, column), lambda r=row, c=column: self._tile(r, c))
+                tile = self._tiles.get((self._name, row, column), lambda r=row, c=column: self._tile(r, c))
                 top, left = max(row * TILE, low[0]), max(column * TILE, low[1])
                 bottom, right = min((row + 1) * TILE, high[0]), min((column + 1) * TILE, high[1])
                 out[top - line : bottom - line, left - sample : right - sample] = tile[

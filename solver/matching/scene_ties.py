@@ -55,6 +55,8 @@ COARSER = 1.1
 ELSEWHERE = "do not overlap"
 #: Floor of robust standard deviations, px.
 FLOOR_PX = 0.05
+#: No places.
+NOWHERE = np.empty((0, 2))
 
 
 @dataclass(frozen=True)
@@ -258,14 +260,13 @@ class SceneMatcher:
         return np.hstack([np.rint(corner), np.minimum(np.rint(corner + side), end)]).astype(np.int64)
 
     def _best_places(
-        self, view: SceneView, cells: NDArray[np.int64], spacing: float, taken: Array | None = None
+        self, view: SceneView, cells: NDArray[np.int64], spacing: float, there: Array = NOWHERE, taken: Array = NOWHERE
     ) -> Array:
-        """The place (n, 2) of best texture in each cell in which none of the places taken already lies."""
+        """The place (n, 2) of best texture in each cell without one that is taken, some distance from all there are."""
         half, apart = WINDOW // 2 + 2, round(APART * WINDOW)
         margin = round(MARGIN_PX * spacing)
         first, end = np.array(view.pixels.first) + margin, np.array(view.pixels.end) - margin
-        taken = np.empty((0, 2)) if taken is None else taken
-        places = np.empty((0, 2))
+        places = np.rint(there)
         for cell in cells:
             low, high = np.maximum(cell[:2], first), np.minimum(cell[2:], end)
             if (high <= low).any() or ((taken >= low) & (taken < high)).all(axis=1).any():
@@ -285,7 +286,7 @@ class SceneMatcher:
             )  # fmt: skip
             if best is not None:
                 places = np.vstack([places, begin + best[:2]])
-        return places
+        return places[len(there) :]
 
     def _points_of(
         self, a: int, b: int, known: _Known, points: list[ScenePoint], report: PairReport
@@ -293,8 +294,9 @@ class SceneMatcher:
         """New points that the master and the other image of a pair have, and others, too."""
         master = self.views[a]
         cells = self._cells(master, known.overlap, TRIED * self.how.points)
-        taken = np.array([p.rays[a][:2] for p in points if a in p.rays and b in p.rays]).reshape(-1, 2)
-        place = self._best_places(master, cells, known.pair.spacing, taken)
+        there = np.array([p.rays[a][:2] for p in points if a in p.rays]).reshape(-1, 2)
+        taken = there[np.array([b in p.rays for p in points if a in p.rays], dtype=bool)]
+        place = self._best_places(master, cells, known.pair.spacing, there, taken)
         report.tried = len(place)
         if not len(place):
             return []
@@ -359,7 +361,8 @@ class SceneMatcher:
         if not both:
             return
         known = self._known[a, b]
-        assert not isinstance(known, str)
+        if isinstance(known, str):  # a third image found them in both
+            return
         pair = known.pair
         place, pixel = (np.array([p.rays[k][:2] for p in both]) for k in (a, b))
         h = self.how.heights(pair.master, place) + known.rise_m

@@ -140,6 +140,15 @@ def test_bands_are_put_together_and_values_of_any_kind_are_matched(block, capsys
     assert "fore.tif: band '2': not in it, wanted 1 to 1" in refusal(capsys, block)
 
 
+def test_scenes_may_be_bands_of_one_file(block):
+    write_image(block / "bands.tif", *(rasterio.open(block / f"{name}.tif").read(1)[:, :280] for name in VIEWS))
+    set_image(block, "fore", 'image = "bands.tif"\nband = 1')
+    set_image(block, "aft", 'image = "bands.tif"\nband = 2')
+    assert main(["match", str(block), "--points", "30", "-q"]) == 0
+    off = [float(a["sample"]) - float(b["sample"]) for a, b in zip(rows(block)[2::2], rows(block)[3::2], strict=True)]
+    assert len(off) > 20 and np.ptp(off) > 10.0
+
+
 def test_a_part_of_a_scene_says_where_it_begins(block, capsys):
     with rasterio.open(block / "aft.tif") as file:
         part = file.read(1)[20:, 35:]

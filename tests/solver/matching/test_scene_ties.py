@@ -70,6 +70,26 @@ def test_a_place_in_three_images_is_one_point_and_every_pair_has_points_all_over
         assert min(quarters) > 0.15
 
 
+def test_no_place_is_measured_twice_where_a_further_image_does_not_show_it():
+    scenes = seen(VIEWS, STATED, 1, 50.0)
+    clouds = scenes[2].pixels.image[:, :110]
+    clouds[:] = 700 + 100 * np.random.default_rng(5).standard_normal(clouds.shape)
+    points, _ = SceneMatcher(scenes, matching(60)).match()
+    assert len(points) > 60
+    for k in range(3):
+        places = np.array([p.rays[k][:2] for p in points if k in p.rays])
+        apart = np.linalg.norm(places[:, None] - places, axis=2) + 99.0 * np.eye(len(places))
+        assert apart.min() > 2.5
+
+
+def test_points_of_a_pair_in_which_nothing_was_found_by_itself(monkeypatch):
+    first = SceneMatcher._first_look
+    monkeypatch.setattr(SceneMatcher, "_first_look", lambda self, a, b: "lost" if b == 1 - a else first(self, a, b))
+    points, reports = SceneMatcher(seen(VIEWS, STATED, 1, 50.0), matching(60)).match()
+    assert (reports[0].why, reports[0].tried) == ("lost", 0) and np.isnan(reports[0].misfit_px)
+    assert reports[0].kept == sum({0, 1} <= set(p.rays) for p in points) > 10
+
+
 def test_misfits_are_those_of_the_models(three):
     # across the parallax, what one model is moved against the other
     _, reports = three
