@@ -76,6 +76,13 @@ class Pair:
         """(2,) unit vector in which heights make no difference."""
         return np.array([-self.along[1], self.along[0]])
 
+    def ways(self, place: Array, height_m: Array) -> Array:
+        """(k, 2) what `along` is at places (k, 2): views of different satellites turn against each other in a scene."""
+        way = parallaxes(self.master, self.other, place, height_m)
+        length = np.linalg.norm(way, axis=1, keepdims=True)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(length > 1e-9, way / length, self.along)
+
     def find(self, place: Array, height_m: Array, guess: Array, reach_px: float) -> Found:
         """`search.find` with shifts and covariances in px of the master."""
         parts = []
@@ -223,17 +230,25 @@ def neighbours_say(known: Array, values: Array, place: Array, itself: bool = Fal
     return np.asarray(np.median(values[near[:, 1:] if itself else near], axis=1))
 
 
-def agreeing(pair: Pair, place: Array, shift: Array, floor_px: float) -> Mask:
-    """Which shifts (k, 2) go with the others: with a plane across the parallax, and with their neighbours along it."""
+def agreeing(place: Array, shift: Array, way: Array, floor_px: float) -> Mask:
+    """Which shifts (k, 2) go with the others: with a plane across the parallax, and with their neighbours along it.
+
+    Parameters
+    ----------
+    place : (k, 2)
+    way : (2,) or (k, 2) unit vectors in which heights move places
+    floor_px : of robust standard deviations
+    """
     good = np.asarray(np.isfinite(shift).all(axis=1))
+    along = np.sum(shift * way, axis=1)
+    across = np.sum(shift * np.stack([-way[..., 1], way[..., 0]], axis=-1), axis=1)
     for _ in range(3):
         k = np.flatnonzero(good)
         if len(k) < FEWEST:
             return np.zeros(len(place), dtype=bool)
-        across, along = shift[k] @ pair.across, shift[k] @ pair.along
-        plane, scale = plane_fit(place[k], across, floor_px)
-        stays = np.abs(across - plane) <= ACROSS_SIGMA * min(scale, MOST_FLOORS * floor_px)
-        left = along - neighbours_say(place[k], along, place[k], itself=True)
+        plane, scale = plane_fit(place[k], across[k], floor_px)
+        stays = np.abs(across[k] - plane) <= ACROSS_SIGMA * min(scale, MOST_FLOORS * floor_px)
+        left = along[k] - neighbours_say(place[k], along[k], place[k], itself=True)
         stays &= np.abs(left) <= ALONG_SIGMA * max(1.4826 * float(np.median(np.abs(left))), 3.0 * floor_px)
         good[k[~stays]] = False
         if stays.all():
@@ -273,7 +288,7 @@ def first_neighbours(
     wide = wide_search(pair, place, height_m, across_px, across_px + most_m * pair.parallax)
     found = np.asarray(np.isfinite(wide.shift).all(axis=1))
     good = found & crowd(wide.shift @ pair.across, wide.score - LEAST_WIDE_SCORE, 3.0 * wide.step_px)
-    good[good] = agreeing(pair, place[good], wide.shift[good], 0.5 * wide.step_px)
+    good[good] = agreeing(place[good], wide.shift[good], pair.along, 0.5 * wide.step_px)
     if good.sum() < max(FEWEST, LEAST_AGREEING * found.sum()):
         return None
     along = float(np.median(wide.shift[good] @ pair.along))
@@ -282,7 +297,8 @@ def first_neighbours(
     shift = shifts_between(pair, place, height_m, wide.pixel[good])
     fine = pair.find(place, height_m, shift, max(2.0 * wide.step_px, 4.0 * pair.spacing))
     good = (fine.reason == "") & (fine.score > LEAST_FINE_SCORE)
-    good[good] = agreeing(pair, place[good], fine.shift[good], 0.1 * pair.spacing)
+    way = pair.ways(place[good], height_m[good])
+    good[good] = agreeing(place[good], fine.shift[good], way, 0.1 * pair.spacing)
     return (neighbours_of(pair, place[good], fine.shift[good]), rise_m) if good.sum() >= FEWEST else None
 
 

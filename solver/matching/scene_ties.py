@@ -323,7 +323,7 @@ class SceneMatcher:
         how, pair = self.how, known.pair
         h = how.heights(pair.master, place) + known.rise_m
         good, shift = np.zeros(len(place), dtype=bool), np.full((len(place), 2), np.nan)
-        covariance = np.full((len(place), 2, 2), np.nan)
+        covariance, way = np.full((len(place), 2, 2), np.nan), pair.ways(place, h)
         waiting = np.flatnonzero(np.isfinite(h))
         for _ in range(ROUNDS):
             guess = known.neighbours.expected(place[waiting])
@@ -337,7 +337,7 @@ class SceneMatcher:
             fine = verdict(found, how.matching) == ""
             shift[k], covariance[k] = np.where(fine[:, None], found.shift, np.nan), found.covariance
             before = int(good.sum())
-            good = agreeing(pair, place, shift, FLOOR_PX * pair.spacing)
+            good = agreeing(place, shift, way, FLOOR_PX * pair.spacing)
             if good.sum() > len(known.neighbours.place):
                 known.neighbours = neighbours_of(pair, place[good], shift[good])
             # what lies beside the search, or is like nothing there, is looked for where closer neighbours say

@@ -11,11 +11,19 @@ from triline.solver.matching.options import MatchingOptions
 from triline.solver.matching.scene_patches import ScenePatches, SceneView, mapping, parallaxes, transferred
 from triline.solver.matching.scene_search import agreeing, crowd, grids, pair_of, plane_fit, shifts_between
 from triline.solver.matching.scene_ties import ELSEWHERE, SceneMatcher, SceneMatching
+from triline.solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass, overpass_beside
 
 #: Turned against each other, of other views and other pixel sizes.
 VIEWS = [View(10, (0.02, 0.0)), View(-20, (0.35, 0.1)), View(55, (-0.3, 0.05), 1.35, 220, 220)]
 #: What the metadata say: 8 to 17 m off.
 STATED = [moved(VIEWS[0], 6, -9), moved(VIEWS[1], -14, 5, 0.1), moved(VIEWS[2], 12, 12)]
+
+
+class Extent(ArrayPixels):
+    """An image without pixels."""
+
+    def __init__(self, lines: int, samples: int):
+        self.first, self.end = (0, 0), (lines, samples)
 
 
 def seen(views: list[View], stated: list[View], seed: int, noise: float) -> list[SceneView]:
@@ -184,9 +192,26 @@ def test_wrong_shifts_do_not_agree():
     shift[:6] += 3.0 * pair.across
     shift[6:9] += 60.0 * pair.along
     shift[9] = np.nan
-    good = agreeing(pair, place, shift, 0.1)
+    good = agreeing(place, shift, pair.along, 0.1)
     assert not good[:10].any() and good[10:].mean() > 0.95
     plane, scale = plane_fit(place[10:], across[10:], 0.01)
     assert plane == pytest.approx(12.0 + 0.01 * place[10:, 0], abs=0.15) and 0.05 < scale < 0.2
     values, weight = np.array([5.0, 5.2, 90.0, np.nan, 4.9]), np.array([0.3, 0.3, 0.5, 0.0, 0.3])
     assert crowd(values, weight, 0.5).tolist() == [True, True, False, False, True]
+
+
+def test_ground_of_all_heights_agrees_where_parallax_turns_within_the_scene():
+    # another satellite that turns back while it images
+    nadir = overpass(ORBITAL_SENSORS["alos-prism"], 36.0, 139.6).sensors["N"]
+    aside = overpass_beside(ORBITAL_SENSORS["eros-a1"], 36.0, 139.6, 15.0).sensors["P"]
+    a, b = (SceneView(n, s, Extent(s.lines, s.samples)) for n, s in (("a", nadir), ("b", aside)))
+    rng = np.random.default_rng(3)
+    place, middle = rng.uniform([4000, 7500], [10500, 12500], (300, 2)), np.full(300, 700.0)
+    height = middle * (1.0 + np.sin(place[:, 0] / 900.0) * np.cos(place[:, 1] / 1300.0))
+    pair = pair_of(a, b, place, middle)
+    pixel = transferred(a, b, place, height) + np.array([3.0, -2.0]) + rng.normal(0.0, 0.05, (300, 2))
+    shift = shifts_between(pair, place, middle, pixel)
+    way = pair.ways(place, middle)
+    shift[:10] += 1.5 * np.stack([-way[:10, 1], way[:10, 0]], axis=1)
+    good = agreeing(place, shift, way, 0.05)
+    assert not good[:10].any() and good[10:].mean() > 0.95
