@@ -101,10 +101,11 @@ def match_scenes(
     with np.errstate(invalid="ignore", divide="ignore"):
         found, reports = SceneMatcher(views, SceneMatching(points, low, high, height_m, far), told).match()
     if all(report.why == ELSEWHERE for report in reports):
-        raise UserError(f"{data.name}: no two images overlap: {', '.join(view.name for view in views)}")
+        at = "the heights given" if height_m else f"heights from {low:.0f} to {high:.0f} m"
+        raise UserError(f"{data.name}: no two images overlap at {at}: {', '.join(view.name for view in views)}")
     if not found:
         first = next(report for report in reports if report.why != ELSEWHERE)
-        raise UserError(f"{data.name}: no tie points: {' and '.join(first.names)}: {first.why or 'none agree'}")
+        raise UserError(f"{data.name}: no tie points: {' and '.join(first.names)}: {first.why}")
     return MatchedScenes(data, found, reports, far, low, high, notes)
 
 

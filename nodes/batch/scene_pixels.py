@@ -67,6 +67,8 @@ class ScenePixels:
         low, high = (max(line, 0), max(sample, 0)), (
             min(line + lines, self.image.lines), min(sample + samples, self.image.samples)
         )  # fmt: skip
+        if low[0] >= high[0] or low[1] >= high[1]:
+            return out
         for row in range(low[0] // TILE, -(-high[0] // TILE)):
             for column in range(low[1] // TILE, -(-high[1] // TILE)):
                 tile = self._tiles.get((self._name, row, column), lambda r=row, c=column: self._tile(r, c))

@@ -195,9 +195,9 @@ def _tell(args: argparse.Namespace, matched: MatchedScenes, result: dict[str, An
 def _words(pair: PairReport) -> str:
     """One line about a pair of images."""
     names = f"{pair.names[0]}, {pair.names[1]}:"
-    if pair.why or not pair.kept:
+    if pair.why:
         through = f"; {pair.kept} points that another image has, too" if pair.kept else ""
-        return f"{names} {pair.why or 'no points'}{through}"
+        return f"{names} {pair.why}{through}"
     counts = f"{pair.tried} places tried, {pair.found} matched, {pair.kept} points kept"
     by = f"{pair.misfit_px:.2f} px ({pair.misfit_px * pair.gsd_m:.2f} m), {pair.left_px:.2f} px beside a plane"
     return f"{names} overlap {100 * pair.overlap:.0f} %, {counts}; rays miss by {by}"

@@ -21,6 +21,7 @@ from .options import REAL_FLOOR_PX, MatchingOptions
 from .places import APART
 from .scene_patches import SceneView, mapping, parallaxes, transferred
 from .scene_search import (
+    FEWEST,
     Neighbours,
     Pair,
     agreeing,
@@ -359,6 +360,8 @@ class SceneMatcher:
         both = [p for p in points if a in p.rays and b in p.rays]
         report.kept = len(both)
         if not both:
+            counts = f"{report.tried} places tried, {report.found} matched"
+            report.why = report.why or f"{counts}, fewer than {FEWEST} of them agree"
             return
         known = self._known[a, b]
         if isinstance(known, str):  # a third image found them in both

@@ -13,6 +13,8 @@ import pytest
 import rasterio
 from scene_pictures import LAT, LON, METRES, View, moved, relief, write_block, write_image
 
+from triline.nodes.batch.image_rectification import SourceImage
+from triline.nodes.batch.scene_pixels import ScenePixels, Tiles
 from triline.nodes.cli import main
 from triline.nodes.formats.satellite.folder_writer import write_overpass
 from triline.nodes.formats.satellite.read import read_scene
@@ -149,6 +151,13 @@ def test_scenes_may_be_bands_of_one_file(block):
     assert len(off) > 20 and np.ptp(off) > 10.0
 
 
+def test_what_lies_outside_an_image_is_empty(block):
+    pixels = ScenePixels(SourceImage(block / "fore.tif"), {0: 1.0}, (0, 0), Tiles())
+    for line, sample in ((310, 20), (20, 310), (-30, 20), (20, -700)):
+        assert not pixels.window(line, sample, 25, 30).any()
+    assert pixels.window(290, 20, 25, 30)[:10].all()
+
+
 def test_a_part_of_a_scene_says_where_it_begins(block, capsys):
     with rasterio.open(block / "aft.tif") as file:
         part = file.read(1)[20:, 35:]
@@ -183,6 +192,7 @@ def test_heights_of_a_raster_are_taken(block, capsys):
 def test_bad_input_is_told_in_one_line(block, tmp_path, capsys):
     assert "no block of satellite scenes" in refusal(capsys, tmp_path)
     assert "--points 0: wanted 1" in refusal(capsys, block, "--points", 0)
+    assert "2 matched, fewer than 5 of them agree" in refusal(capsys, block, "--points", 2)
     assert "--search-m -1: wanted more than 0" in refusal(capsys, block, "--search-m", -1)
     assert "--dem-crs: goes with --dem" in refusal(capsys, block, "--dem-crs", "EPSG:4326")
     assert "no folder" in refusal(capsys, block, "-o", tmp_path / "none" / "points.csv")
@@ -207,7 +217,7 @@ def test_images_that_do_not_overlap_are_told(tmp_path, capsys):
     views = {"east": View(0, (0.0, 0.0), at_m=(5000.0, 0.0), lines=60, samples=60), "west": View(0, (0.1, 0.0))}
     views["west"] = replace(views["west"], lines=60, samples=60)
     write_block(tmp_path, views, views, 3)
-    assert "no two images overlap: east, west" in refusal(capsys, tmp_path)
+    assert "no two images overlap at heights from 100 to 400 m: east, west" in refusal(capsys, tmp_path)
 
 
 def test_two_lenses_with_rigorous_models(tmp_path, capsys):
