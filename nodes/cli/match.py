@@ -189,6 +189,10 @@ def _tell(args: argparse.Namespace, matched: MatchedScenes, result: dict[str, An
         print(f"{result['rows_kept']} rows of image_points.csv stay{before}")
     for note in result["notes"]:
         print(f"  note: {note}")
+    table = args.folder / "image_points.csv"
+    if result["output"] != str(table) and not (table.exists() and table.samefile(result["output"])):
+        print(f"next: `triline adjust` takes these points when they are {table}")
+        return
     print(f"next: triline adjust {shlex.quote(str(args.folder))} --snoop -o result")
 
 

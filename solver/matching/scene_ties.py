@@ -256,7 +256,7 @@ class SceneMatcher:
         count = np.ceil(size / side).astype(int)
         corner = np.stack([k.ravel() for k in np.meshgrid(*map(np.arange, count), indexing="ij")], axis=1) * side
         middle = np.minimum(corner + 0.5 * side, size - 1)
-        node = np.rint(middle / (size - 1) * (NODES - 1)).astype(int)
+        node = np.rint(middle / np.maximum(size - 1, 1) * (NODES - 1)).astype(int)
         corner = corner[seen[node[:, 0] * NODES + node[:, 1]]] + first
         return np.hstack([np.rint(corner), np.minimum(np.rint(corner + side), end)]).astype(np.int64)
 

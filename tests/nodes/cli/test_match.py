@@ -112,6 +112,9 @@ def test_what_is_said_ends_with_what_to_do_next(block, capsys):
     out = capsys.readouterr().out.splitlines()
     assert out[1].startswith("  fore, aft: overlap ") and "rays miss by" in out[1]
     assert out[-1] == f"next: triline adjust {block} --snoop -o result"
+    assert main(["match", str(block), "--points", "20", "-o", str(block / "others.csv")]) == 0
+    said = capsys.readouterr().out.splitlines()[-1]
+    assert said == f"next: `triline adjust` takes these points when they are {block / 'image_points.csv'}"
 
 
 def test_tables_with_semicolons_and_decimal_commas_stay_such(block):
@@ -211,6 +214,12 @@ def test_bad_input_is_told_in_one_line(block, tmp_path, capsys):
     text = (block / "project.toml").read_text()
     (block / "project.toml").write_text(text[: text.index("[scenes.aft]")])
     assert "one image, wanted two or more" in refusal(capsys, block)
+
+
+def test_an_image_may_be_one_pixel(block, capsys):
+    write_image(block / "dot.tif", np.ones((1, 1), dtype=np.uint8))
+    set_image(block, "fore", 'image = "dot.tif"\nfirst_pixel = [150, 150]')
+    assert "no texture where both may see the ground" in refusal(capsys, block)
 
 
 def test_images_that_do_not_overlap_are_told(tmp_path, capsys):
