@@ -348,10 +348,10 @@ class SceneMatcher:
         k = np.flatnonzero(good)
         pixel, sigma, own = np.full((len(place), 2), np.nan), np.full(len(place), np.nan), np.full(len(place), np.nan)
         pixel[k], slope = mapping(pair.master, pair.other, place[k] + shift[k], h[k])
-        # half of a match's variance belongs to each of its two images
-        floor = 0.5 * how.matching.image_sigma_px**2
-        turned = slope @ covariance[k] @ np.swapaxes(slope, 1, 2)
-        own[k], sigma[k] = (np.sqrt(0.25 * np.trace(c, axis1=1, axis2=2) + floor) for c in (covariance[k], turned))
+        # half of a match's variance belongs to each of its two images; what is added is of the coarser one's pixels
+        C = covariance[k] + (how.matching.image_sigma_px * pair.spacing) ** 2 * np.eye(2)
+        turned = slope @ C @ np.swapaxes(slope, 1, 2)
+        own[k], sigma[k] = (np.sqrt(0.25 * np.trace(c, axis1=1, axis2=2)) for c in (C, turned))
         return _Looks(np.asarray(np.isfinite(shift).all(axis=1)), good, pixel, sigma, own)
 
     def _tell_misfit(self, report: PairReport, points: list[ScenePoint]) -> None:

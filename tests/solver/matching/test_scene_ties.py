@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scene_pictures import HIGH_M, LOW_M, ArrayPixels, View, errors_of, moved, textured
@@ -105,6 +107,16 @@ def test_misfits_are_those_of_the_models(three):
     move = np.array([-14 - 6, 5 + 9])
     across = abs(tilt[0] * move[1] - tilt[1] * move[0]) / np.hypot(*tilt)
     assert reports[0].misfit_px == pytest.approx(across, abs=0.3)
+
+
+def test_what_residuals_do_not_show_is_as_large_on_the_ground_in_both_images():
+    views = [replace(VIEWS[0], lines=400, samples=400), replace(VIEWS[1], gsd_m=3.0, lines=130, samples=130)]
+    stated = [moved(views[0], 6, -9), moved(views[1], -14, 5, 0.1)]
+    how = replace(matching(40), matching=MatchingOptions(image_sigma_px=0.2, largest_sigma_px=0.25))
+    points, _ = SceneMatcher(seen(views, stated, 1, 8.0), how).match()
+    fine, coarse = (np.array([p.rays[k][2] for p in points]) for k in (0, 1))
+    assert len(points) > 10 and coarse.min() > 0.14
+    assert fine == pytest.approx(3.0 * coarse, rel=0.05)
 
 
 def test_known_heights_need_no_search_along_the_parallax():
