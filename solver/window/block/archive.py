@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Generator, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from zlib import crc32
 
 import numpy as np
 
@@ -209,12 +210,12 @@ class Archive:
     def linearise_single(self, solution: BlockSolution) -> Parts:
         """Linearise single looks at a solution, so that the ties to them in the window are as good as it; in parts.
 
-        Of too many some are forgotten, evenly, so that those of each strip are left to strips that cross it later.
+        Of too many some are forgotten, evenly over the flight, so that those of each strip are left to strips that
+        cross it later: batch by batch, which looks share, and of all that ever came the same share, by a number that a
+        batch has once and for all.
         """
         names = [name for name, kept in self.points.items() if kept.single is not None]
-        share = min(MOST_SINGLE / max(len(names), 1), 1.0)
-        stays = np.diff(np.floor(share * np.arange(len(names) + 1) + 0.5)) > 0
-        for name in (names[i] for i in np.flatnonzero(~stays)):
+        for name in sorted(names, key=self._turn)[MOST_SINGLE:]:
             del self.points[name]
         done: set[int] = set()
         for kept in self.points.values():
@@ -227,6 +228,12 @@ class Archive:
                     done.add(id(batch))
                     yield REFINED_POINTS
                 kept.left = kept.single.left() or kept.left
+
+    def _turn(self, name: str) -> int:
+        """Single looks are forgotten from the highest number on."""
+        single = self.points[name].single
+        assert single is not None
+        return crc32(single.batch.names[0].encode())
 
     def _keep(self, name: str, kept: KeptPoint) -> None:
         """Put a point in place of what is known of it, as the newest."""

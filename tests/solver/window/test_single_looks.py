@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -372,6 +373,25 @@ def test_what_a_drift_does_to_a_single_look_is_known(flight, monkeypatch):
         batch.rays = rays
         batch.linearise(batch.theta, reweigh=False)
         assert effect[:, group + 1] == pytest.approx(moved, rel=1e-3, abs=1e-3)
+
+
+def test_what_is_kept_of_a_long_flight_is_even(monkeypatch):
+    """Each solution forgot some of all looks that were left, so that of the first of 12 parts 1 in 50 was left, and of
+    the last one all."""
+    monkeypatch.setattr(archive, "MOST_SINGLE", 600)
+    block = archive.Archive(np.empty(0, dtype=np.int64), np.empty(0))
+    solution = SimpleNamespace(of=lambda columns: (None, None))
+    for second in range(0, 1200, 4):
+        names = tuple(f"S{second // 60}-M{10 * second + i}" for i in range(10))
+        batch = SimpleNamespace(
+            names=names, columns=None, back_substitute=lambda _: None, linearise=lambda *_, **__: None
+        )
+        single = SimpleNamespace(batch=batch, left=lambda: None)
+        block.points |= {name: SimpleNamespace(single=single, left=None, time_s=second) for name in names}
+        list(block.linearise_single(solution))
+    time_s = [kept.time_s for kept in block.points.values()]
+    assert len(time_s) == 600 and len({id(kept.single.batch) for kept in block.points.values()}) == 60
+    assert (np.histogram(time_s, np.arange(0, 1201, 200))[0] > 40).all()
 
 
 @pytest.mark.study
