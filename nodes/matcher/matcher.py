@@ -398,7 +398,8 @@ class Matcher(Node):
         out = [self._tie(strip, tie) for tie in ties]
         out += [self._log(f"{strip}: {text}", warning=True) for text in matcher.take_events()]
         failed = sum(matcher.counters[name] for name in FAILED)
-        out += [self._log(text, warning=True) for text in self._without_ties(failed, len(ties))]
+        tied = sum(tie.again or len(tie.rays) > 1 for tie in ties)  # else another strip may see its place
+        out += [self._log(text, warning=True) for text in self._without_ties(failed, tied)]
         self.counters.update(matcher.counters)
         matcher.counters.clear()
         return out

@@ -60,6 +60,7 @@ class StripView:
     strip, view : the strip and the CCD line
     lines : those that have come
     chooser : chooses places in them
+    first_line : number of the first that came
     chosen_to : places have been chosen before this line, or need not be
     """
 
@@ -67,9 +68,10 @@ class StripView:
     view: View
     lines: LineIntake
     chooser: PlaceChooser
+    first_line: int = 0
     chosen_to: float = -np.inf
-    _whole: tuple[int, LineScan | None] = (-1, None)
-    _share: tuple[int, float] = (-1, 1.0)
+    _whole: tuple[tuple[float, ...], LineScan | None] = ((), None)
+    _share: tuple[tuple[float, ...], float] = ((), 1.0)
 
     @property
     def ring(self) -> LineRing | None:
@@ -103,22 +105,27 @@ class StripView:
         """All of its lines; while the strip is taken, those from ``first`` on."""
         if self.ring is None:
             return None
-        if not self.strip.over:
-            return self.scan(max(first, self.ring.start), self.ring.end)
-        changes, scan = self._whole
-        if changes != self.strip.orientation.changes:
-            scan = self.scan(self.ring.start, self.ring.end)
-            self._whole = self.strip.orientation.changes, scan
+        first = self.ring.start if self.strip.over else max(first, self.ring.start)
+        of, scan = self._whole
+        now = (*self._known, first, self.ring.end)
+        if of != now:  # else another strip has asked for it
+            scan = self.scan(first, self.ring.end)
+            self._whole = now, scan
         return scan
 
     @property
     def ground_share(self) -> float:
         """Way of the middle pixel on the ground as a share of the platform's way, over the whole strip."""
-        changes, share = self._share
-        if not self.strip.over or changes != self.strip.orientation.changes:
+        of, share = self._share
+        if of != self._known:
             share = self._ground_share()
-            self._share = self.strip.orientation.changes, share
+            self._share = self._known, share
         return share
+
+    @property
+    def _known(self) -> tuple[float, float]:
+        """Tells orientations from those that were known earlier."""
+        return self.strip.orientation.changes, self.strip.orientation.end_s
 
     def _ground_share(self) -> float:
         o = self.strip.orientation
@@ -127,7 +134,8 @@ class StripView:
         rays /= np.linalg.norm(rays, axis=1)[:, None]
         tilt, above = self.tilt(), above_sphere(self.middle()[0])
         way = position + rays * above / np.cos(min(tilt, LARGEST_TILT))
-        return max(float(np.linalg.norm(way[1] - way[0]) / np.linalg.norm(position[1] - position[0])), LEAST_SHARE)
+        flown = float(np.linalg.norm(position[1] - position[0]))
+        return max(float(np.linalg.norm(way[1] - way[0])) / flown, LEAST_SHARE) if flown else 1.0
 
     def middle(self) -> tuple[Array, Array]:
         """Perspective centre and direction (3,) of the middle pixel in the middle of the strip."""

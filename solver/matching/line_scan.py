@@ -91,9 +91,10 @@ class LineScan:
 
     @property
     def way(self) -> Array:
-        """(2,) horizontal direction of the flight from its first line to its last, of length 1."""
+        """(2,) horizontal direction of the flight from its first line to its last, of length 1; X where it hovers."""
         way = self.position_l[-1, :2] - self.position_l[0, :2]
-        return way / np.linalg.norm(way)
+        length = float(np.linalg.norm(way))
+        return way / length if length else np.array([1.0, 0.0])
 
     def to_plane(self, line: Array, sample: Array, height_m: Array) -> tuple[Array, Array]:
         """Ground points (n, 3) of pixels at given heights, and the rays' slopes dX/dZ, dY/dZ (n, 2).

@@ -115,6 +115,11 @@ class PairPrediction(Prediction):
         a, b = (ray / np.linalg.norm(ray, axis=1)[:, None] for ray in rays)
         return float(np.median(np.arcsin(np.clip(np.linalg.norm(np.cross(a, b), axis=1), 0.0, 1.0))))
 
+    def tells_heights(self, places: Sequence[Place]) -> bool:
+        """Whether rays of both views meet at such an angle that a pixel is less than what heights are known to before;
+        those of a line that was flown twice do not."""
+        return self._pixel_m <= self.angle(places) * self.heights.prior_sigma_m
+
     def seen(self, places: Sequence[Place]) -> Array:
         """Line and sample (n, 2) of the other view that see places, about; NaN where none does."""
         here, there = self.whole
@@ -162,8 +167,7 @@ class PairPrediction(Prediction):
     def heights_tried(self, places: Sequence[Place]) -> Array:
         """Heights of the ground, the likeliest first; a search at one of them reaches to the next."""
         sine = np.sin(self.angle(places))
-        pixel = self.height_and_travel()[0] * self.views[0].pitch_mm / self.views[0].focal_length_mm
-        step = 2 * (1 - OVERLAP) * self.options.largest_reach_px * pixel / max(float(sine), 1e-3)
+        step = 2 * (1 - OVERLAP) * self.options.largest_reach_px * self._pixel_m / max(float(sine), 1e-3)
         prior, low = self.heights.prior_m, min(self.heights.lowest_m, self.heights.prior_m)
         high = min(HIGHEST_GROUND_M, self.platform_m - LEAST_ABOVE * (self.platform_m - low))
         below, higher = (int(np.ceil(max(reach, 0.0) / step)) for reach in (prior - low, high - prior))
@@ -172,8 +176,12 @@ class PairPrediction(Prediction):
 
     def _three_sigma_px(self) -> float:
         """How far a look may lie from where the orientations put it, px."""
-        return self._orientation_reach(self.views[1], self.height_and_travel()[0] * self.views[0].pitch_mm
-                                       / self.views[0].focal_length_mm)  # fmt: skip
+        return self._orientation_reach(self.views[1], self._pixel_m)
+
+    @property
+    def _pixel_m(self) -> float:
+        """Size of a pixel across on the ground, m, about."""
+        return self.height_and_travel()[0] * self.views[0].pitch_mm / self.views[0].focal_length_mm
 
 
 def _located(scan: LineScan, point_l: Array) -> tuple[Array, Array]:

@@ -173,7 +173,7 @@ class StripMatcher:
             lines = LineIntake(samples, self.options, lambda dtype: self._store(samples, dtype))
             lines.begin_strip(strip.times.rate, first_line)
             chooser = PlaceChooser(self.options, 2 * LEAST_SQUARES_HALF + 1, 1)
-            strip.views[ccd] = StripView(strip, self._views[ccd], lines, chooser)
+            strip.views[ccd] = StripView(strip, self._views[ccd], lines, chooser, first_line)
         lines = strip.views[ccd].lines
         usable = lines.add(ccd, first_line, pixels)
         self._events += lines.take_events()
@@ -228,9 +228,9 @@ class StripMatcher:
         """Forget the oldest strips where the budget is used up; tell where it did not hold all lines of a strip."""
         for ccd, view in ended.views.items():
             ring = view.ring
-            if ring is not None and ring.start > 0:
-                held = f"{self.options.budget_mb / self._at_once:g} MB hold"
-                self._events.append(f"{ccd}: {held} the last {ring.end - ring.start} of {ring.end} lines")
+            if ring is not None and ring.start > view.first_line:
+                held, come = f"{self.options.budget_mb / self._at_once:g} MB hold", ring.end - view.first_line
+                self._events.append(f"{ccd}: {held} the last {ring.end - ring.start} of {come} lines")
         while sum(s.nbytes for s in self._strips.values()) > 1e6 * self.options.budget_mb and len(self._strips) > 2:
             oldest = next(s for s in self._strips.values() if s is not ended)
             del self._strips[oldest.id]

@@ -81,6 +81,7 @@ class StripPair:
         self.counters: Counter[str] = Counter()
         self.events: list[str] = []
         self._views, self._late, self._options = (master.view, view), late, options
+        self._heights = heights
         self._prediction = PairPrediction(self._views, late, options, heights)
         self._looks = LookMatcher(self._prediction, self._image, 0)
         self._decided: NDArray[np.bool_] = np.zeros(0, dtype=bool)  # places of which nothing more is to be asked
@@ -199,6 +200,8 @@ class StripPair:
         p = self._prediction
         if self._found:
             return True
+        if not p.tells_heights([self.master.places[number] for number in numbers.tolist()]):
+            p.heights = replace(self._heights)  # others are not to take what it finds for the ground
         shifts = p.beside(along_too=True)
         if p.heights.some and len(shifts) == 1:
             self._found = True
@@ -246,7 +249,7 @@ class StripPair:
                 continue
             p.heights.found(points)
             p.heights_changed()
-            if abs(p.heights.prior_m - prior) > 3 * p.heights.prior_sigma_m:
+            if p.heights is self._heights and abs(p.heights.prior_m - prior) > 3 * p.heights.prior_sigma_m:
                 found = f"the ground was found at about {p.heights.prior_m:.0f} m above the origin"
                 self.events.append(f"{found}, not at {prior:.0f} m")
             return True

@@ -28,6 +28,7 @@ from triline.nodes.report.evaluation import evaluate
 from triline.schemas.topics import rank
 from triline.solver.adjustment.adjustment import adjust
 from triline.solver.adjustment.block_data import network_from_block
+from triline.solver.camera.line_camera import LineCamera
 from triline.solver.camera.sensors import preset
 from triline.solver.geometry.rotation import angles_from_matrix
 from triline.solver.matching.line_times import LineTimes
@@ -265,6 +266,48 @@ def test_matched_strips_of_one_ccd_line_are_as_good_as_they_say(world, tmp_path)
     assert (after < 0.75 * before).all()
 
 
+@pytest.fixture(scope="module")
+def flown_twice(tmp_path_factory):
+    """Messages of a line that was flown forth and back, and of a strip across it."""
+    folder = tmp_path_factory.mktemp("twice")
+    sensor, flight, out = folder / "camera.json", folder / "flight.mcap", folder / "out.mcap"
+    sensor.write_text(CAMERA.replace("500", "300").replace("0.0384", "0.064"))
+    plan = [
+        "--strips",
+        "2",
+        "--cross",
+        "1",
+        "--sidelap",
+        "0.999",
+        "--seconds",
+        "12",
+        "--height",
+        "1000",
+        "--speed",
+        "60",
+    ]
+    simulate = ["simulate", "-q", "-o", str(flight), "--sensor", str(sensor), "--images", *plan, "--no-turns"]
+    assert main([*simulate, "--control", "0", "--check", "0", "--seed", "7"]) == 0
+    assert main(["process", str(flight), "-o", str(out), "-q", "--nodes", "navigator", "--processes", "1"]) == 0
+    return list(RecordingReader(out).messages())
+
+
+def test_a_line_that_is_flown_twice_tells_no_heights(flown_twice):
+    """Its rays are nearly parallel: a pixel is 330 m of height. The strip across was looked for on ground that was as
+    wrong as that, and 14 of its places were found."""
+    seen = {}
+    for out in through(Matcher(), flown_twice):
+        if out.topic == "observation/tie":
+            seen.setdefault(out.body.point, set()).update(image.strip for image in out.body.images)
+    assert sum({"S1", "S2"} <= strips for strips in seen.values()) > 120
+    assert sum({"S1", "C1"} <= strips for strips in seen.values()) > 120
+
+
+def test_a_strip_without_ties_is_told_though_each_of_its_places_is_a_point_at_once(flown_twice):
+    told = [out.body.message for out in through(Matcher(ground_m=400.0), flown_twice) if out.topic == "event/log"]
+    assert [text.partition(":")[0] for text in told if "no tie point at" in text] == ["C1"]
+
+
 def test_process_without_the_matcher_says_that_images_have_no_tie_points(tmp_path, capsys):
     sensor, flight = tmp_path / "camera.json", tmp_path / "flight.mcap"
     sensor.write_text(CAMERA)
@@ -282,6 +325,41 @@ def test_lines_that_a_budget_does_not_hold():
     out = through(node, messages)
     told = [o.body.message for o in out if o.topic == "event/log"]
     assert [text for text in told if "hold the last" in text and "of 300 lines" in text]
+
+
+def of_one_line(pose, first_line=0):
+    """A matcher of a camera with one CCD line, 1 km up, and its only strip, of 300 lines and 12 s."""
+    camera = preset("spot5-hrs")
+    line = camera.lines[0]
+    lens = tuple(lens for lens in camera.lenses if lens.id == line.lens)
+    matcher = StripMatcher(LineCamera("one", lens, (line,)))
+    matcher.begin_strip("S1", LineTimes(-first_line / 25.0, 25.0), first_line)
+    for t in np.arange(0.0, 12.0, 0.05):
+        matcher.add_pose(t, pose(t), np.array([0.0, 0, 0, 1]), np.diag(np.full(6, 1e-6)))
+    matcher.add_lines(line.id, first_line, np.full((300, 12000), 700, np.uint16))
+    return matcher, matcher._strips["S1"].views[line.id]
+
+
+def test_lines_that_do_not_begin_at_0_are_all_held():
+    """It was told that the budget holds the last 300 of 5300 lines."""
+    matcher, _ = of_one_line(lambda t: np.array([60.0 * t, 0.0, 1000.0]), first_line=5000)
+    matcher.end_strip("S1")
+    assert not [text for text in matcher.take_events() if "hold" in text]
+
+
+def test_lines_of_a_strip_that_is_taken_are_put_together_once():
+    """Each of the earlier strips asks for them every two seconds."""
+    matcher, view = of_one_line(lambda t: np.array([60.0 * t, 0.0, 1000.0]))
+    scan = view.whole(100.0)
+    assert scan is not None and scan.first_line == 100 and view.whole(100.0) is scan
+    matcher.add_pose(12.0, np.array([720.0, 0.0, 1000.0]), np.array([0.0, 0, 0, 1]), np.diag(np.full(6, 1e-6)))
+    assert view.whole(100.0) is not scan
+
+
+def test_a_platform_that_hovers_has_no_way():
+    """Not a number: a fault with each block of lines once another strip saw the same ground."""
+    _, view = of_one_line(lambda t: np.array([0.0, 0.0, 1000.0]))
+    assert view.ground_share == 1.0 and view.whole().way.tolist() == [1.0, 0.0]
 
 
 def test_the_first_lines_of_a_long_strip_keep_their_orientation():
