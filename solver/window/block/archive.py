@@ -195,7 +195,7 @@ class Archive:
     def place_single(self, height_m: float) -> None:
         """Linearise the looks that are not placed where their rays come to the height of the ground; those whose rays
         do not are forgotten."""
-        for name in self.unplaced:
+        for name in sorted(self.unplaced):
             kept = self.points.get(name)
             if kept is None or kept.single is None or not kept.unplaced:
                 continue

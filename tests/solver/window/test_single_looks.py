@@ -375,6 +375,18 @@ def test_what_a_drift_does_to_a_single_look_is_known(flight, monkeypatch):
         assert effect[:, group + 1] == pytest.approx(moved, rel=1e-3, abs=1e-3)
 
 
+def test_looks_are_placed_in_the_same_order_in_each_run():
+    """They are linearised together, batch by batch; in the order of a set two runs gave other bytes."""
+    block = archive.Archive(np.empty(0, dtype=np.int64), np.empty(0))
+    order, names = [], [f"M{i:02d}" for i in range(40)]
+    for name in names:
+        single = SimpleNamespace(place_above=lambda _, name=name: order.append(name))
+        block.points[name] = SimpleNamespace(single=single, unplaced=True)
+        block.unplaced.add(name)
+    block.place_single(0.0)
+    assert order == names and not block.points and not block.unplaced
+
+
 def test_what_is_kept_of_a_long_flight_is_even(monkeypatch):
     """Each solution forgot some of all looks that were left, so that of the first of 12 parts 1 in 50 was left, and of
     the last one all."""
