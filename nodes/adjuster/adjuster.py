@@ -43,6 +43,8 @@ FAST_HZ, WAIT_S = 240.0, 0.012
 #: How far the time of a pose can be after the stamp of its message, s: what goes beyond is no flight, and unknowns for
 #: all of it would take the memory and the time of the others.
 POSE_AHEAD_S = 60.0
+#: A strip that has ended and begins so much earlier or later than before, s, has been flown again. Definition.
+FLOWN_AGAIN_S = 1.0
 #: Length of the window while it is not known, s.
 DEFAULT_WINDOW_S = 25.0
 
@@ -335,6 +337,12 @@ class Adjuster(Node):
         known = self._strips.bodies.get(body.id)
         if known is not None and known.ended and body.ended:
             return []
+        if known is not None and known.ended:
+            later_s = (body.first_line_time_ns - known.first_line_time_ns) / convert.SECOND_NS
+            if abs(later_s) > FLOWN_AGAIN_S:
+                self.counters["strip flown again"] += 1
+                words = f"strip {body.id} has ended and begins once more, {later_s:.0f} s after its first line: what is"
+                return [self._log(f"{words} flown now is left out; it wants the name of another strip", warning=True)]
         self._strips.bodies[body.id] = body
         if self._window is None:
             return []

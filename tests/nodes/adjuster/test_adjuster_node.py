@@ -136,6 +136,35 @@ def test_the_operator_is_told_what_the_result_rests_on(done, flight):
     assert any("datum rest on GNSS" in text for text in in_flight), "the reason has changed under a light that has not"
 
 
+def test_a_strip_that_is_flown_again_under_its_name_is_told_and_left_out(done, flight):
+    """It was told as begun, and all of it was lost without a word."""
+    last = flight[1][-1].stamp_ns
+    strip = next(x.body for x in reversed(flight[1]) if x.topic == "configuration/strip")
+    again, same = m.Strip(), m.Strip()
+    for body, later_s in ((again, 300), (same, 0)):
+        body.CopyFrom(strip)
+        body.ended, body.lines, body.first_line_time_ns = (
+            False,
+            0,
+            strip.first_line_time_ns + later_s * convert.SECOND_NS,
+        )
+    node = Adjuster(grid_hz=2.0)
+    for message in flight[1]:
+        node.step(message)
+    texts = [
+        o.body.message for o in node.step(Message("configuration/strip", last + 1, again)) if o.topic == "event/log"
+    ]
+    assert texts == [
+        "strip S1 has ended and begins once more, 300 s after its first line: what is flown now is left out; it wants "
+        "the name of another strip"
+    ]
+    assert node.counters["strip flown again"] == 1
+    texts = [
+        o.body.message for o in node.step(Message("configuration/strip", last + 2, same)) if o.topic == "event/log"
+    ]
+    assert not any("once more" in text for text in texts)  # who announces it was started again
+
+
 def test_same_messages_same_bytes(done, flight):
     again = run(Adjuster(grid_hz=10.0), flight[1])
     first, second = (
