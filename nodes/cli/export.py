@@ -1,9 +1,9 @@
-"""``triline export``: a topic of a recording to CSV, Parquet, GeoJSON, GeoPackage or SBET."""
+"""``triline export``: a topic of a recording to CSV, Parquet, GeoJSON, GeoPackage, SBET or SMRMSG."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -25,18 +25,25 @@ from ..batch.rectification import (
     lines_of_recording,
     project_frame,
 )
-from ..convert import R_bc_of, local_frame, pose_sample
+from ..convert import PoseSample, R_bc_of, local_frame, pose_sample
 from ..errors import UserError
 from ..formats.camera_json import write_camera
 from ..formats.features import NOT_PLACED, Features, answers, features_of
 from ..formats.geojson import write_geojson
 from ..formats.geopackage import write_geopackage
 from ..formats.json_text import json_text
-from ..formats.line_orientation import OrientedLines, write_oriented_lines, write_patb_lines, write_sbet_lines
+from ..formats.line_orientation import (
+    OrientedLines,
+    write_oriented_lines,
+    write_patb_lines,
+    write_sbet_lines,
+    write_smrmsg_lines,
+)
 from ..formats.new_file import new_file
 from ..formats.projection import refuse_missing_grids
 from ..formats.rows import ElementLayout, RowLayout, repeated_messages
 from ..formats.sbet import write_sbet_poses
+from ..formats.smrmsg import write_smrmsg_poses
 from ..node import Message
 from ..recording.access import Recording
 from ..recording.reader import RecordingReader
@@ -51,14 +58,14 @@ EXAMPLE = """triline export flight.mcap --topic orientation/final --csv orientat
 
 #: Messages turned into rows at a time.
 BATCH = 20_000
-_LINE_FORMATS = ("csv", "patb", "sbet")
+_LINE_FORMATS = ("csv", "patb", "sbet", "smrmsg")
 #: Option (as attribute) -> targets that it goes with, for those that do not go with all.
 _GO_WITH = {
     "format": ("per_line",),
     "covariance": ("points",),
     "orientation": ("per_line",),
     "rows": ("csv", "parquet"),
-    "every": ("csv", "parquet", "geojson", "gpkg", "sbet"),
+    "every": ("csv", "parquet", "geojson", "gpkg", "sbet", "smrmsg"),
 }
 
 
@@ -76,6 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     target.add_argument(
         "--sbet", metavar="FILE", help="poses of trajectory/*, orientation/* or truth/trajectory as SBET"
     )
+    target.add_argument("--smrmsg", metavar="FILE", help="the accuracies of these poses, which an SBET has not")
     target.add_argument(
         "--points",
         metavar="FILE",
@@ -86,7 +94,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--format", choices=_LINE_FORMATS,
-        help="with --per-line: CSV with sigmas (default), PATB-like rows of position and rotation matrix, or SBET",
+        help="with --per-line: CSV with sigmas (default), PATB-like rows of position and rotation matrix, SBET, "
+        "or the accuracies of that (SMRMSG)",
     )  # fmt: skip
     parser.add_argument("--covariance", action="store_true", default=None, help="of the points, with --points")
     parser.add_argument(
@@ -117,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
     if kind in ("points", "per_line"):
         return _run_table(path, args)
     if args.topic is None:
-        raise UserError("--topic: wanted with --csv, --parquet, --geojson, --gpkg and --sbet")
+        raise UserError("--topic: wanted with --csv, --parquet, --geojson, --gpkg, --sbet and --smrmsg")
     reader = RecordingReader(path)
     try:
         row = topics.find(args.topic)
@@ -205,7 +214,7 @@ def _write_lines(
 ) -> int:
     if format == "patb":
         return write_patb_lines(path, lines, frame)
-    write = write_sbet_lines if format == "sbet" else write_oriented_lines
+    write = {"sbet": write_sbet_lines, "smrmsg": write_smrmsg_lines}.get(format or "csv", write_oriented_lines)
     return write(path, lines, frame, R_bc)
 
 
@@ -314,9 +323,38 @@ def _not_valid(features: Features) -> dict[str, int]:
 
 def _write_sbet(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:
     """Poses of the body: the boresight of the project is taken out; positions are those of the perspective centre."""
+    project, frame, samples, lost = _valid_poses(reader, args, "--sbet")
+    time_ns, position, quaternion = _columns(samples)
+    seconds = (time_ns - time_ns[0]) * 1e-9
+    velocity_l = Trajectory(seconds, position, quaternion).at(seconds).velocity_l
+    write_sbet_poses(target, time_ns, position, matrix_from_quaternion(quaternion), velocity_l, frame, R_bc_of(project))
+    return {"records": len(time_ns)} | lost
+
+
+def _write_smrmsg(reader: RecordingReader, args: argparse.Namespace, target: Path) -> dict[str, int]:
+    """Accuracies of what `_write_sbet` writes."""
+    project, frame, samples, lost = _valid_poses(reader, args, "--smrmsg")
+    time_ns, position, quaternion = _columns(samples)
+    unknown = np.full((6, 6), np.nan)
+    covariance = np.array([unknown if sample.covariance is None else sample.covariance for sample in samples])
+    R_lc = matrix_from_quaternion(quaternion)
+    count = write_smrmsg_poses(target, time_ns, position, R_lc, covariance, frame, R_bc_of(project))
+    bare = len(samples) - count
+    return {"records": count} | lost | ({"poses left out, without covariance": bare} if bare else {})
+
+
+def _valid_poses(
+    reader: RecordingReader, args: argparse.Namespace, option: str
+) -> tuple[Any, LocalFrame, list[PoseSample], dict[str, int]]:
+    """Project, local frame, valid poses, two at least, and what is said of those that are not.
+
+    Raises
+    ------
+    UserError : a topic without poses, a recording whose place is not known, too few poses
+    """
     if topics.find(args.topic).type is not m.PoseInFrame:
         poses = ", ".join(row.name for row in topics.TOPICS if row.type is m.PoseInFrame)
-        raise UserError(f"--sbet: {args.topic} has no poses; topics that have: {poses}")
+        raise UserError(f"{option}: {args.topic} has no poses; topics that have: {poses}")
     project, frame = _project_and_frame(reader)
     if frame is None:
         raise UserError(
@@ -331,17 +369,20 @@ def _write_sbet(reader: RecordingReader, args: argparse.Namespace, target: Path)
         except ValueError as error:
             reader.problems["malformed"] += 1
             reader.last_problem = str(error)
-    lost = sum(not sample.valid for sample in samples)  # SBET has neither a flag nor sigmas
+    lost = sum(not sample.valid for sample in samples)  # neither format has a flag
     samples = [sample for sample in samples if sample.valid]
     if len(samples) < 2:
         raise UserError(f"{reader.path}: {len(samples)} valid poses on {args.topic}, wanted at least 2")
-    time_ns = np.array([sample.time_ns for sample in samples], dtype=np.int64)
-    position = np.array([sample.position_l for sample in samples])
-    quaternion = np.array([sample.quaternion for sample in samples])
-    seconds = (time_ns - time_ns[0]) * 1e-9
-    velocity_l = Trajectory(seconds, position, quaternion).at(seconds).velocity_l
-    write_sbet_poses(target, time_ns, position, matrix_from_quaternion(quaternion), velocity_l, frame, R_bc_of(project))
-    return {"records": len(time_ns)} | ({"poses left out, not valid": lost} if lost else {})
+    return project, frame, samples, {"poses left out, not valid": lost} if lost else {}
+
+
+def _columns(samples: Sequence[PoseSample]) -> tuple[NDArray[np.int64], NDArray[Any], NDArray[Any]]:
+    """Times (n,), positions (n, 3) and quaternions (n, 4) of poses."""
+    return (
+        np.array([sample.time_ns for sample in samples], dtype=np.int64),
+        np.array([sample.position_l for sample in samples]),
+        np.array([sample.quaternion for sample in samples]),
+    )
 
 
 #: Those that write tables.
@@ -352,4 +393,5 @@ _WRITERS: dict[str, Callable[[RecordingReader, argparse.Namespace, Path], dict[s
     "geojson": _write_geojson,
     "gpkg": _write_gpkg,
     "sbet": _write_sbet,
+    "smrmsg": _write_smrmsg,
 }

@@ -45,11 +45,11 @@ GO_WITH: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("sensors", "ros2"), _SENSORS),
     **dict.fromkeys(("avirisng", "pos", "headwall", "resonon", "gpx"), _POSES),
     **dict.fromkeys(("avirisc", "csv"), (*_POSES, "crs")),
-    "sbet": (*_POSES, "seconds_of_day"),
+    "sbet": (*_POSES, "seconds_of_day", "accuracies"),
     **dict.fromkeys(("block", "scenes"), _IMAGES),
     "lines": ("date", "camera", "line_rate", *_IMAGES),
 }
-_OPTIONS = ("crs", "seconds_of_day", *_POSES)
+_OPTIONS = ("crs", "seconds_of_day", "accuracies", *_POSES)
 #: Options that go with ``--flight``: what the folder cannot say of data that are not in it.
 _BESIDE_FLIGHT = ("date", "line_rate", *_IMAGES)
 
@@ -91,6 +91,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"lines a second: of images, of AVIRIS-C (default {LINE_RATE_HZ:g})",
     )
     parser.add_argument("--seconds-of-day", action="store_true", default=None, help="SBET times count from midnight")
+    parser.add_argument(
+        "--accuracies", type=Path, metavar="FILE",
+        help="accuracies of the poses of an SBET, as SMRMSG (default: smrmsg_7.out beside sbet_7.out)",
+    )  # fmt: skip
     ground = parser.add_argument_group("the ground, where the origin of the local frame is put (one of them)")
     ground.add_argument("--ground-height", type=float, metavar="M", help="of the ground above the ellipsoid")
     ground.add_argument("--above-ground", type=float, metavar="M", help="so high the platform flies above the ground")
@@ -152,6 +156,7 @@ def run(args: argparse.Namespace) -> int:
             args.line_rate or LINE_RATE_HZ,
             None if args.camera is None else camera_named(args.camera, "--camera", of_camera),
             args.seconds_of_day,
+            args.accuracies,
             _accuracy(args),
             _lines(args, kind),
             _ground(args),

@@ -35,7 +35,7 @@ def refuse_empty_words(argv: list[str]) -> None:
 #: Options that name a file which a command writes.
 _WRITTEN = (
     *("output", "csv", "map_csv", "plot", "page", "mask", "sigma", "source", "seam_lines", "stac"),
-    *("parquet", "geojson", "gpkg", "sbet", "points", "per_line", "rrd"),
+    *("parquet", "geojson", "gpkg", "sbet", "smrmsg", "points", "per_line", "rrd"),
 )
 #: Files of a block, a flight, a sensor folder or scenes that no other file of the folder names.
 _OF_FOLDERS = {

@@ -36,6 +36,7 @@ from .scene_images import with_scene_images
 from .scene_recording import local_block
 from .sensor_folder import SensorFolder, read_sensor_folder
 from .sensor_recording import sensor_extent, sensor_fixes, sensor_messages
+from .smrmsg import is_smrmsg
 from .tie_points import statistics, tie_point_messages
 from .tiff_image import is_tiff
 from .time_columns import same_day
@@ -78,6 +79,8 @@ class Options:
     line_rate_hz : of files with a pose a line and no times
     camera : put into the recording as ``configuration/camera``
     seconds_of_day : SBET times count from midnight
+    accuracies : SMRMSG file with those of the poses of an SBET; None for the one beside it under its name, if there is
+        one
     accuracy : of poses
     lines : images of a strip, beside poses or sensors, or (with the file itself as image) alone
     ground : where the origin of the local frame is to lie
@@ -93,6 +96,7 @@ class Options:
     line_rate_hz: float = LINE_RATE_HZ
     camera: LineCamera | None = None
     seconds_of_day: bool | None = None
+    accuracies: Path | None = None
     accuracy: Accuracy = field(default_factory=Accuracy)
     lines: LinesGiven | None = None
     ground: GroundGiven = NOT_GIVEN
@@ -163,6 +167,8 @@ def kind_of_path(path: Path) -> str:
         return "resonon"
     if b"\0" not in head and is_trajectory_csv(path):
         return "csv"
+    if is_smrmsg(path):
+        raise UserError(f"{path}: accuracies of poses (SMRMSG), wanted their SBET, beside which it is found")
     if is_sbet(path):
         return "sbet"
     if is_envi_image(path) or is_tiff(path):
@@ -186,7 +192,7 @@ def read_track(path: Path, kind: str, options: Options) -> NavigationTrack:
     if kind == "pos":
         return read_pos_export(path, options.day)
     if kind == "sbet":
-        return read_sbet(path, options.day, seconds_of_day=options.seconds_of_day)
+        return read_sbet(path, options.day, seconds_of_day=options.seconds_of_day, accuracies=options.accuracies)
     if kind == "headwall":
         return read_headwall(path, options.day)
     if kind == "resonon":

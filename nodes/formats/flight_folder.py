@@ -86,7 +86,7 @@ _KEYS = {
     "flight": ("name", "platform", "crs", "vertical_datum", "ground_height_m", "above_ground_m", "origin_deg"),
     "camera": ("file", "preset"),
     "mounting": ("lever_arm_m", "camera_lever_arm_m", "boresight_deg"),
-    "navigation": ("file", "kind", "date", "gnss", "imu", "images", "line_rate_hz"),
+    "navigation": ("file", "accuracies", "kind", "date", "gnss", "imu", "images", "line_rate_hz"),
     "trajectory": (*SIGMAS, *WANDER_TIMES),
     "imu": (*_IMU, "gyro_scale_ppm", "accel_scale_ppm"),
     "control": ("file",),
@@ -155,6 +155,7 @@ class Flight:
     lever_arm_m : antenna from the inertial sensor, body axes forward-right-down
     mounting : of the camera on the body
     navigation, kind, day : file of poses or sensors, one of `NAVIGATION`, and the day of the flight
+    accuracies : SMRMSG file with those of the poses of an SBET, where the folder names one
     track : the poses, where the file has poses and not sensors
     tables : of a sensor folder, as they were read
     places_deg : (n, 2) latitude and longitude of some places that were flown over; None where they are not known
@@ -184,6 +185,7 @@ class Flight:
     navigation: Path | None = None
     kind: str = ""
     day: date | None = None
+    accuracies: Path | None = None
     track: NavigationTrack | None = None
     tables: SensorFolder | None = None
     places_deg: Array | None = None
@@ -356,6 +358,7 @@ def flight_messages(folder: Path, instead: Instead | None = None) -> tuple[Impor
         flight.crs,
         flight.mounting,
         camera=flight.camera if flight.kind == "ros2" else None,
+        accuracies=flight.accuracies,
         lines=flight.lines,
         accuracy=_accuracy(flight.sigmas),
         ground=flight.ground if asked else GroundGiven(flight.ground_height_m),
@@ -569,7 +572,13 @@ def _navigation(flight: Flight, keys: Keys, live: bool, instead: Instead) -> Non
     elif instead.navigation is None:
         of_bag = [keys.name(key) for key in ("images", "line_rate_hz") if keys.has(key)]
         flight.problems.extend(f"{keys.path}: {key}: goes with a ROS 2 bag, not with {KINDS[kind]}" for key in of_bag)
-    options = Options(day, flight.crs or None, camera=flight.camera if kind == "ros2" else None, lines=flight.lines)
+    if instead.navigation is None and keys.has("accuracies"):
+        if kind == "sbet":
+            flight.accuracies = _beside(flight, keys, "accuracies", keys.text("accuracies"))
+        else:
+            flight.problems.append(f"{keys.path}: {keys.name('accuracies')}: goes with an SBET, not with {KINDS[kind]}")
+    bag_camera = flight.camera if kind == "ros2" else None
+    options = Options(day, flight.crs or None, camera=bag_camera, accuracies=flight.accuracies, lines=flight.lines)
     if kind in ("sensors", "ros2"):
         if kind == "sensors":
             flight.tables = read_sensor_folder(path)
@@ -784,6 +793,7 @@ boresight_deg = [0.0, 0.0, 0.0]   # roll, pitch, heading of the camera against t
 
 [navigation]
 file = "navigation.csv"           # sensor folder, CSV, SBET, POS export, ROS 2 bag, imu_gps.txt, .lcf ...
+#accuracies = "smrmsg_7.out"      # of the poses of an SBET, where they are not beside it under its name
 #kind = "csv"                     # where the file does not show it: {kinds}
 #images = {{N = "/camera/nadir"}}   # topics of a ROS 2 bag whose images are image lines
 #date = 2024-05-17                # day of the flight, for files with GPS seconds of the week

@@ -15,6 +15,7 @@ from ...solver.geometry.frames import LocalFrame, navigation_from_R_lc
 from ...solver.geometry.rotation import R_BC_NOMINAL, angles_from_matrix, angles_jacobian
 from ..errors import UserError
 from .sbet import write_sbet_poses
+from .smrmsg import write_smrmsg_poses
 from .table import csv_field
 
 Array = NDArray[np.floating]
@@ -115,23 +116,48 @@ def write_sbet_lines(path: Path, parts: Iterable[OrientedLines], frame: LocalFra
     ------
     UserError : the place of the local frame is not known; no line
     """
+    time_ns, position, R, velocity, _ = _by_time(parts, frame)
+    write_sbet_poses(path, time_ns, position, R, velocity, frame, R_bc)
+    return len(time_ns)
+
+
+def write_smrmsg_lines(
+    path: Path, parts: Iterable[OrientedLines], frame: LocalFrame, R_bc: Array = R_BC_NOMINAL
+) -> int:
+    """Write the accuracies of what `write_sbet_lines` writes as SMRMSG records, and return their number.
+
+    Raises
+    ------
+    UserError : the place of the local frame is not known; no line with a covariance
+    """
+    time_ns, position, R, _, covariance = _by_time(parts, frame)
+    return write_smrmsg_poses(path, time_ns, position, R, covariance, frame, R_bc)
+
+
+def _by_time(parts: Iterable[OrientedLines], frame: LocalFrame) -> tuple[NDArray[np.int64], Array, Array, Array, Array]:
+    """Times, places, rotations, velocities and covariances of lines in order of time; a time comes once.
+
+    Raises
+    ------
+    UserError : the place of the local frame is not known; no line
+    """
     if not frame.is_placed:
         raise UserError(
             "SBET has latitude and longitude, wanted the origin of the local frame in configuration/project"
         )
-    times, positions, rotations, velocities = [], [], [], []
+    times, columns = [], []
     for part in parts:
         time_ns, first = np.unique(part.time_ns, return_index=True)
         position = part.position_l[first]
-        times.append(time_ns), positions.append(position), rotations.append(part.R_lc[first])
         time_s = (time_ns - time_ns[0]) * 1e-9
-        velocities.append(np.gradient(position, time_s, axis=0) if len(time_s) > 1 else np.zeros((1, 3)))
+        velocity = np.gradient(position, time_s, axis=0) if len(time_s) > 1 else np.zeros((1, 3))
+        times.append(time_ns)
+        columns.append((position, part.R_lc[first], velocity, part.covariance[first]))
     if not times:
         raise UserError("no image line with an orientation, wanted at least one")
     time_ns, first = np.unique(np.concatenate(times), return_index=True)
-    position, R, velocity = (np.concatenate(some)[first] for some in (positions, rotations, velocities))
-    write_sbet_poses(path, time_ns, position, R, velocity, frame, R_bc)
-    return len(time_ns)
+    position, R, velocity, covariance = (np.concatenate(some)[first] for some in zip(*columns, strict=True))
+    return time_ns, position, R, velocity, covariance
 
 
 def _in_crs(position_l: Array, R_lc: Array, frame: LocalFrame) -> tuple[Array, Array]:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...solver.geometry.frames import LocalFrame, navigation_from_R_lc
 from ..errors import UserError
 from .gps_time import DAY_S, gps_from_utc_ns
+from .smrmsg import beside, read_smrmsg
 from .track import NavigationTrack, checked, times_from_gps
 
 #: Fields of a record: seconds; radians; metres; m/s and m/s^2 in the wander frame; rad/s in the body.
@@ -32,15 +33,18 @@ def is_sbet(path: Path) -> bool:
     return bool(0 <= time < 2 * 604800 and abs(lat) <= np.pi / 2 and abs(lon) <= 2 * np.pi and np.isfinite(first).all())
 
 
-def read_sbet(path: Path, day: date | None = None, *, seconds_of_day: bool | None = None) -> NavigationTrack:
+def read_sbet(
+    path: Path, day: date | None = None, *, seconds_of_day: bool | None = None, accuracies: Path | None = None
+) -> NavigationTrack:
     """Poses of an SBET file. True heading is the platform heading less the wander angle.
 
     Times are GPS seconds of the week, or of the day: ``seconds_of_day`` says which; None takes them as seconds of the
-    day where all are below one day and ``day`` is not a Sunday or Monday.
+    day where all are below one day and ``day`` is not a Sunday or Monday. ``accuracies`` is the SMRMSG file with the
+    accuracies of the poses; None takes the one beside the file under its name, if there is one.
 
     Raises
     ------
-    UserError : a file that is not whole records, or values that no pose can have
+    UserError : a file that is not whole records, values that no pose can have, or accuracies of other poses
     """
     size = path.stat().st_size
     if size == 0 or size % RECORD:
@@ -63,11 +67,17 @@ def read_sbet(path: Path, day: date | None = None, *, seconds_of_day: bool | Non
     with np.errstate(over="ignore"):  # a damaged file overflows here and is refused below
         lat_lon = np.degrees(np.column_stack([column["lat"], column["lon"]]))
     heading = column["platform_heading"] - column["wander_angle"]
+    source = accuracies or beside(path)
+    accuracy = None if source is None else read_smrmsg(source, column["time"])
+    if source is not None and accuracy is not None:
+        notes.extend((f"{path.name}: accuracies of the poses are those of {source.name}", *accuracy.notes))
     track = NavigationTrack(
         path.stem,
         time,
         np.column_stack([lat_lon, column["alt"]]),
         np.column_stack([column["roll"], column["pitch"], (heading + np.pi) % (2 * np.pi) - np.pi]),
+        None if accuracy is None else accuracy.sigma_ned_m,
+        None if accuracy is None else accuracy.sigma_rpy,
         notes=tuple(notes),
     )
     return checked(track, path)

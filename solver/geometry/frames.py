@@ -324,6 +324,19 @@ def navigation_from_R_lc(
 
 def opk_covariance_from_navigation(rpy: ArrayLike, R_lc: ArrayLike, R_ln: ArrayLike, cov_rpy: ArrayLike) -> Array:
     """Covariance (..., 3, 3) of omega, phi, kappa from that of roll, pitch, heading; all radians."""
+    J = _opk_of_rpy(rpy, R_lc, R_ln)
+    return J @ np.asarray(cov_rpy) @ np.swapaxes(J, -1, -2)
+
+
+def navigation_covariance_from_opk(rpy: ArrayLike, R_lc: ArrayLike, R_ln: ArrayLike, cov_opk: ArrayLike) -> Array:
+    """Covariance (..., 3, 3) of roll, pitch, heading from that of omega, phi, kappa; all radians; inverse of
+    `opk_covariance_from_navigation`."""
+    J = np.linalg.inv(_opk_of_rpy(rpy, R_lc, R_ln))
+    return J @ np.asarray(cov_opk) @ np.swapaxes(J, -1, -2)
+
+
+def _opk_of_rpy(rpy: ArrayLike, R_lc: ArrayLike, R_ln: ArrayLike) -> Array:
+    """Derivatives (..., 3, 3) of omega, phi, kappa with respect to roll, pitch, heading."""
     rpy = np.asarray(rpy, dtype=float)
     sp, cp = np.sin(rpy[..., 1]), np.cos(rpy[..., 1])
     sh, ch = np.sin(rpy[..., 2]), np.cos(rpy[..., 2])
@@ -331,5 +344,4 @@ def opk_covariance_from_navigation(rpy: ArrayLike, R_lc: ArrayLike, R_ln: ArrayL
     axes_n[..., 0, 0], axes_n[..., 1, 0], axes_n[..., 2, 0] = ch * cp, sh * cp, -sp
     axes_n[..., 0, 1], axes_n[..., 1, 1] = -sh, ch
     axes_n[..., 2, 2] = 1.0
-    J = angles_jacobian(angles_from_matrix(R_lc)) @ np.asarray(R_ln) @ axes_n
-    return J @ np.asarray(cov_rpy) @ np.swapaxes(J, -1, -2)
+    return angles_jacobian(angles_from_matrix(R_lc)) @ np.asarray(R_ln) @ axes_n

@@ -61,6 +61,7 @@ from triline.nodes.formats.keys import Keys
 from triline.nodes.formats.satellite.earth_orientation_file import read_c04, read_finals
 from triline.nodes.formats.satellite.read import read_scene
 from triline.nodes.formats.satellite.rpc_files import rasterio_rpc, read_rpc_tags, write_rpb, write_rpc_text
+from triline.nodes.formats.smrmsg import write_smrmsg
 from triline.nodes.formats.tiff_image import open_tiff
 from triline.nodes.node import Message, Node
 from triline.nodes.ordering import StreamCheck
@@ -445,8 +446,8 @@ class FileTarget:
     values_bytes: int = 0
 
 
-def _read_all(path: Path) -> None:
-    for _ in detect.read_any(path, detect.kind_of_path(path)).messages:
+def _read_all(path: Path, options: detect.Options | None = None) -> None:
+    for _ in detect.read_any(path, detect.kind_of_path(path), options).messages:
         pass
 
 
@@ -478,6 +479,9 @@ def file_targets(folder: Path) -> list[FileTarget]:
 
     sbet = write_sbet_file(folder)
     whole("SBET", sbet, partial(_read_all, sbet))
+    accuracies = folder / "accuracies.out"  # with a name of its own, so that the SBET alone is read alone
+    write_smrmsg(accuracies, np.fromfile(sbet, "<f8")[::17], np.full((50, 3), 0.05), np.full((50, 3), 1e-4))
+    whole("SMRMSG", accuracies, partial(_read_all, sbet, detect.Options(accuracies=accuracies)))
     small = folder / "small"
     small.mkdir()
     others = small_files(small)

@@ -257,6 +257,13 @@ def test_lines_as_sbet_are_those_of_the_csv(oriented, tmp_path, capsys):
     north_m = np.radians(np.gradient(track.geodetic[one, 0], track.time_ns[one] * 1e-9)) * 6.37e6
     np.testing.assert_allclose(values[one, 4], north_m, atol=0.5)
     assert np.linalg.norm(values[:, 4:7], axis=1).min() > 10.0
+    accuracies = tmp_path / "lines.smrmsg"  # beside the SBET under its name
+    assert main(["export", str(recording), "--per-line", str(accuracies), "--format", "smrmsg"]) == 0
+    again = read_sbet(out, day)
+    np.testing.assert_allclose(again.sigma_ned_m[:, 2], lines.sigma_Z_m, atol=1e-4)
+    # along and across are turned against those of the CRS by the convergence, which is small
+    np.testing.assert_allclose(again.sigma_ned_m[:, :2], lines[["sigma_Y_m", "sigma_X_m"]], rtol=0.02)
+    np.testing.assert_allclose(np.degrees(again.sigma_rpy[:, 2]), lines.sigma_kappa_deg, rtol=0.05)
 
 
 def test_formats_of_lines_are_refused_in_one_line(oriented, block, tmp_path, capsys):

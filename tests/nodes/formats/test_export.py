@@ -112,7 +112,7 @@ def test_one_row_a_message_with_columns_named_as_the_fields(recording, tmp_path)
     assert table["velocity.x_m_s"].isna().all()  # a sub-message that was not sent
 
 
-@pytest.mark.parametrize("kind", ["csv", "geojson", "gpkg", "parquet", "sbet"])
+@pytest.mark.parametrize("kind", ["csv", "geojson", "gpkg", "parquet", "sbet", "smrmsg"])
 def test_a_full_disk_is_told_with_the_file_and_leaves_nothing(recording, tmp_path, capsys, kind):
     target = tmp_path / f"o.{kind}"
     with files_of_at_most(1000):
@@ -498,6 +498,16 @@ def test_configuration_that_is_stated_again_counts(tmp_path):
     assert np.degrees(np.fromfile(tmp_path / "o.sbet", "<f8")[1]) == pytest.approx(48.5, abs=1e-3)
 
 
+def test_smrmsg_has_no_poses_without_covariance(recording, tmp_path, capsys):
+    words = ["export", str(recording), "--topic", "orientation/final", "--smrmsg", str(tmp_path / "o.out")]
+    assert main(words) == 0
+    assert "19 records, 1 poses left out, without covariance" in capsys.readouterr().out
+    values = np.fromfile(tmp_path / "o.out", "<f8").reshape(-1, 10)
+    assert len(values) == 19
+    np.testing.assert_allclose(values[:, 1:4], np.tile([0.2, 0.1, 0.3], (19, 1)))  # north, east, down of X, Y, Z
+    np.testing.assert_array_equal(values[:, 4:7], 0.0)
+
+
 def test_sbet_has_no_poses_that_are_not_valid(tmp_path, capsys):
     poses = [
         Message(
@@ -590,7 +600,10 @@ def test_sbet_comes_back_as_the_track_it_was(tmp_path):
         (["--topic", "sensor/gnss", "--sbet", "o"], "--sbet: sensor/gnss has no poses"),
         (["--topic", "sensor/gnss", "--csv", "no/o"], "no folder"),
         (["--topic", "sensor/gnss", "--csv", "o", "--every", "0"], "--every 0, wanted at least 1"),
-        (["--points", "o", "--every", "1"], "--every: wanted with --csv, --parquet, --geojson, --gpkg and --sbet only"),
+        (
+            ["--points", "o", "--every", "1"],
+            "--every: wanted with --csv, --parquet, --geojson, --gpkg, --sbet and --smrmsg only",
+        ),
         (["--points", "o", "--orientation", "final"], "--orientation: wanted with --per-line only"),
         (["--points", "o", "--rows", "none"], "--rows: wanted with --csv and --parquet only"),
         (["--points", "o", "--format", "csv"], "--format: wanted with --per-line only"),
