@@ -207,6 +207,7 @@ def test_files_that_the_campaign_found(targets, name, change, said):
     target = next(t for t in targets if t.name == name)
     campaign = Campaign()
     data = change(target)
+    target.read()  # what a reader imports is not the memory of a file
     try:
         target.path.write_bytes(data)
         campaign.run(name, data, target.read, len(target.good))
