@@ -45,7 +45,9 @@ COLUMNS = ("time_s", *_VALUES, *(f"sigma_{name}" for name in _SIGMAS))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("input", metavar="INPUT", help="recording, or sensor folder (imu.csv, gnss.csv, platform.toml)")
+    parser.add_argument(
+        "input", metavar="INPUT", help="recording, or sensor folder (imu.csv, gnss.csv or gnss.pos, platform.toml)"
+    )
     parser.add_argument("-o", "--output", metavar="DIR", help="folder for the results (default: INPUT/navigation)")
     parser.add_argument("--platform", metavar="FILE", help="platform.toml to use instead of the one in the folder")
     parser.add_argument("--no-smooth", action="store_true", help="write what the filter knew at each time")

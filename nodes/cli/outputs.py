@@ -40,7 +40,8 @@ _WRITTEN = (
 #: Files of a block, a flight, a sensor folder or scenes that no other file of the folder names.
 _OF_FOLDERS = {
     *("project.toml", "flight.toml", "platform.toml", "camera.json", "expected.json"),
-    *("strips.csv", "trajectory.csv", "ground_points.csv", "image_points.csv", "imu.csv", "gnss.csv", "attitude.csv"),
+    *("strips.csv", "trajectory.csv", "ground_points.csv", "image_points.csv"),
+    *("imu.csv", "gnss.csv", "gnss.pos", "attitude.csv"),
 }
 _LONGEST_TEXT = 1_000_000
 

@@ -30,11 +30,12 @@ from .image_lines import ImageStrip, LinesGiven, open_strip, with_lines
 from .pos_export import is_pos_export, read_pos_export
 from .ros2 import ros2_messages
 from .ros2_images import ImageTopics
+from .rtklib import is_rtklib
 from .sbet import is_sbet, read_sbet
 from .scene_block import is_scene_block, read_scene_block
 from .scene_images import with_scene_images
 from .scene_recording import local_block
-from .sensor_folder import SensorFolder, read_sensor_folder
+from .sensor_folder import SensorFolder, positions_alone, read_sensor_folder
 from .sensor_recording import sensor_extent, sensor_fixes, sensor_messages
 from .smrmsg import is_smrmsg
 from .tie_points import statistics, tie_point_messages
@@ -51,7 +52,7 @@ KINDS = {
     "flight": "flight folder (flight.toml)",
     "block": "block folder (camera.json, strips.csv, trajectory.csv, ground_points.csv, image_points.csv)",
     "scenes": "block of satellite scenes (project.toml with [scenes.NAME])",
-    "sensors": "sensor folder (imu.csv, gnss.csv, attitude.csv)",
+    "sensors": "sensor folder (imu.csv, gnss.csv or gnss.pos, attitude.csv)",
     "avirisng": "AVIRIS-NG line-by-line poses (angYYYYMMDDtHHMMSS_eph_att)",
     "avirisc": "AVIRIS-C ephemeris (fYYMMDDtNNpNNrNN..._eph)",
     "pos": "Applanix POS Export text",
@@ -60,6 +61,7 @@ KINDS = {
     "headwall": "Headwall poses (imu_gps.txt)",
     "resonon": "Resonon poses (.lcf)",
     "gpx": "GPX track",
+    "rtklib": "RTKLIB positions (.pos)",
     "ros2": "ROS 2 bag (folder with metadata.yaml, MCAP file or .db3 file) with NavSatFix, Imu and Image",
     "lines": "image lines: ENVI image with .hdr, TIFF, or with --raw plain values",
     "ties": "AVIRIS-NG tie points (GeoCal XML)",
@@ -130,7 +132,7 @@ def kind_of_path(path: Path) -> str:
             return "scenes"
         if is_block_folder(path):
             return "block"
-        if any((path / name).is_file() for name in ("imu.csv", "gnss.csv", "attitude.csv")):
+        if any((path / name).is_file() for name in ("imu.csv", "gnss.csv", "gnss.pos", "attitude.csv")):
             return "sensors"
         if (path / "metadata.yaml").is_file():
             return "ros2"
@@ -161,6 +163,8 @@ def kind_of_path(path: Path) -> str:
         return kind
     if is_pos_export(path):
         return "pos"
+    if is_rtklib(path):
+        return "rtklib"
     if is_headwall(path):
         return "headwall"
     if is_resonon(path):
@@ -225,7 +229,7 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
     if kind == "lines":
         return _image_alone(path, options)
     notes: list[str] = []
-    if kind in ("sensors", "ros2") or (kind == "gpx" and not has_attitudes(path)):
+    if kind in ("sensors", "rtklib", "ros2") or (kind == "gpx" and not has_attitudes(path)):
         topics = _image_topics(options) if kind == "ros2" else None
         folder = options.folder
         if kind == "gpx":
@@ -233,7 +237,7 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
             notes.extend(positions.notes)
             messages = position_messages(positions, options.accuracy, notes, "import")
         elif topics is None:
-            folder = folder or read_sensor_folder(path)
+            folder = folder or (positions_alone if kind == "rtklib" else read_sensor_folder)(path)
             messages = sensor_messages(folder, notes, grade=options.grade)
         else:
             messages = _with_noise(ros2_messages(path, notes, given=topics), options.grade)

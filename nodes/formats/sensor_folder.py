@@ -1,4 +1,4 @@
-"""Sensor folder: raw inertial and GNSS data as CSV, and platform.toml with lever arms and noise."""
+"""Sensor folder: raw inertial and GNSS data, and platform.toml with lever arms and noise."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from ...solver.navigation.inertial_data import MEMS, GnssData, InertialData, Ine
 from ..convert import LATEST_S
 from ..errors import UserError
 from .keys import Keys, read_toml
+from .rtklib import read_rtklib
 from .table import Column, Table, read_table, separator_of
 from .track import MOST_BORESIGHT_DEG, MOST_LEVER_ARM_M
 
@@ -99,11 +100,12 @@ class SensorFolder:
     time_s : (n,) stamps of the inertial samples, or None without imu.csv
     rotation, force : (n, 3) angular rates (rad/s) and specific forces (m/s^2), or increments (rad, m/s)
     increments : whether they are increments
-    gnss : fixes, or None without gnss.csv
+    gnss : fixes, or None without gnss.csv and gnss.pos
     attitude : or None without attitude.csv
     platform : of platform.toml, or defaults
     notes : remarks on reading
     offset_s : added to the times in output files
+    gnss_file : name of the file that the fixes are from
     """
 
     path: Path
@@ -116,6 +118,13 @@ class SensorFolder:
     platform: Platform
     notes: list[str] = field(default_factory=list)
     offset_s: float = 0.0
+    gnss_file: str = "gnss.csv"
+
+    @property
+    def name(self) -> str:
+        """That of the folder; of positions alone that of their file."""
+        alone = self.gnss_file not in ("gnss.csv", "gnss.pos")
+        return Path(self.gnss_file).stem if alone else self.path.resolve().name
 
     def cleaned(self) -> tuple[InertialData, GnssData, list[Finding]]:
         """Data for the navigator, and findings about what was taken out of them.
@@ -127,7 +136,7 @@ class SensorFolder:
         if self.time_s is None or self.rotation is None or self.force is None:
             raise UserError(f"{self.path}: imu.csv is missing, wanted inertial data ({','.join((*FORCE, *RATE))})")
         if self.gnss is None:
-            raise UserError(f"{self.path}: gnss.csv is missing, wanted GNSS positions")
+            raise UserError(f"{self.path}: gnss.csv (or gnss.pos) is missing, wanted GNSS positions")
         time, rotation, force, findings = clean_inertial(
             self.time_s, self.rotation, self.force, increments=self.increments
         )
@@ -141,7 +150,7 @@ class SensorFolder:
             raise UserError(f"{self.path}: {self.named(finding)}")
         if len(gnss) < 2:
             why = "".join(f"; {finding.text}" for finding in more)
-            raise UserError(f"{self.path / 'gnss.csv'}: only {len(gnss)} usable fixes, wanted at least 4{why}")
+            raise UserError(f"{self.path / self.gnss_file}: only {len(gnss)} usable fixes, wanted at least 4{why}")
         return make(time, rotation, force), gnss, findings
 
     def named(self, finding: Finding) -> str:
@@ -153,14 +162,17 @@ class SensorFolder:
             "imu.rate": ("imu.csv", rate),
             "imu.axes": ("imu.csv", (*force, *rate)),
             "imu.noise": ("platform.toml", ("[imu]",)),
-            "gnss.time": ("gnss.csv", ("time_s",)),
-            "gnss.sigma": ("gnss.csv", SIGMA),
-            "gnss.position": ("gnss.csv", POSITION),
-            "gnss.velocity": ("gnss.csv", VELOCITY),
+            "gnss.time": (self.gnss_file, ("time_s",)),
+            "gnss.sigma": (self.gnss_file, SIGMA),
+            "gnss.position": (self.gnss_file, POSITION),
+            "gnss.velocity": (self.gnss_file, VELOCITY),
         }.get(finding.subject)
         if where is None:
             return finding.text
         file, columns = where
+        if file == self.gnss_file and not file.endswith(".csv"):  # its columns have other names
+            row = "" if finding.place is None else f" position {finding.place[0] + 1}:"
+            return f"{file}:{row} {finding.text}"
         if finding.place is not None and (self.path / file).is_file():
             row, column = finding.place
             return f"{file}:{Table(self.path / file, {}).line_of(row)}: {columns[column]}: {finding.text}"
@@ -176,16 +188,32 @@ def read_sensor_folder(path: str | Path, platform_file: Path | None = None) -> S
     """
     folder = Path(path)
     if not folder.is_dir():
-        raise UserError(f"{folder}: not a folder, wanted one with imu.csv and gnss.csv")
+        raise UserError(f"{folder}: not a folder, wanted one with imu.csv and gnss.csv (or gnss.pos)")
     notes: list[str] = []
     time, rotation, force, increments = _read_imu(folder / "imu.csv", notes)
-    gnss = _read_gnss(folder / "gnss.csv", notes)
+    rtklib = folder / "gnss.pos"
+    if rtklib.is_file() and (folder / "gnss.csv").is_file():
+        raise UserError(f"{folder}: gnss.csv and gnss.pos, wanted one of them")
+    gnss = read_rtklib(rtklib, notes) if rtklib.is_file() else _read_gnss(folder / "gnss.csv", notes)
     attitude = _read_attitude(folder / "attitude.csv", notes)
     platform = read_platform(platform_file or folder / "platform.toml", notes)
     if platform.initial is None and attitude is not None and time is not None:
         initial = _initial_of(attitude, float(time.min()))
         platform = Platform(**{**vars(platform), "initial": initial})
-    return SensorFolder(folder, time, rotation, force, increments, gnss, attitude, platform, notes)
+    file = rtklib.name if rtklib.is_file() else SensorFolder.gnss_file
+    return SensorFolder(folder, time, rotation, force, increments, gnss, attitude, platform, notes, gnss_file=file)
+
+
+def positions_alone(path: Path) -> SensorFolder:
+    """RTKLIB positions as a sensor folder that has nothing else.
+
+    Raises
+    ------
+    UserError : as `read_rtklib`
+    """
+    notes = [f"{path.name}: positions without attitudes: they become sensor/gnss, not poses"]
+    gnss = read_rtklib(path, notes)
+    return SensorFolder(path.parent, None, None, None, False, gnss, None, Platform(), notes, gnss_file=path.name)
 
 
 def _read_imu(path: Path, notes: list[str]) -> tuple[Array | None, Array | None, Array | None, bool]:

@@ -57,14 +57,14 @@ def sensor_messages(
         notes.append(f"platform.toml: [imu]: a recording has no place for biases and scale factors; {how}")
     messages = [*_imu(folder, notes, source), *_gnss(folder, notes, source), *_attitude(folder, source)]
     if not messages:
-        raise UserError(f"{path}: no usable sample in imu.csv, gnss.csv or attitude.csv")
+        raise UserError(f"{path}: no usable sample in imu.csv, {folder.gnss_file} or attitude.csv")
     messages.sort(key=lambda message: (message.stamp_ns, rank(message.topic)))
     if folder.gnss is None:
-        notes.append(f"{path / 'gnss.csv'}: no such file: without GNSS the navigator makes no poses")
+        notes.append(f"{path / folder.gnss_file}: no such file: without GNSS the navigator makes no poses")
     platform = folder.platform
     arm = np.asarray(platform.lever_arm_m) - np.asarray(platform.camera_lever_arm_m)
     project = m.Project(
-        name=path.resolve().name,
+        name=folder.name,
         crs="local",
         lever_arm_m=arm.tolist(),
         boresight_deg=platform.boresight_deg,
@@ -91,7 +91,7 @@ def sensor_extent(folder: SensorFolder) -> tuple[tuple[int, int], Array]:
     UserError : no GNSS
     """
     if folder.gnss is None:
-        raise UserError(f"{folder.path / 'gnss.csv'}: no such file, wanted GNSS positions")
+        raise UserError(f"{folder.path / folder.gnss_file}: no such file, wanted GNSS positions")
     times = [folder.gnss.time_s]
     times += [folder.time_s] if folder.time_s is not None else []
     times += [folder.attitude.time_s] if folder.attitude is not None and folder.time_s is None else []

@@ -23,6 +23,8 @@ FIELDS = (
 RECORD = 8 * len(FIELDS)
 #: No inertial unit knows roll and pitch better, arc minutes (0.0003 deg): those that are smaller are in other units.
 LEAST_ARCMIN = 0.02
+#: More m or arc minutes than a pose that is worth its name is uncertain by.
+MOST_SIGMA = 1e5
 _ARCMIN = np.pi / 180 / 60
 
 
@@ -74,7 +76,7 @@ def read_smrmsg(path: Path, seconds: Array) -> PoseAccuracies:
     if len(bad):
         raise UserError(f"{path}: record {bad[0] + 1}: time: {time[bad[0]]:.6g}, wanted seconds of the SBET")
     time, poses = unwrap_weeks(time), unwrap_weeks(seconds)
-    good = ((sigma > 0) & np.isfinite(sigma)).all(axis=1) & _rising(time)
+    good = ((sigma > 0) & (sigma < MOST_SIGMA)).all(axis=1) & _rising(time)
     notes: list[str] = []
     if not good.all():
         what = "without accuracies above 0, or not after the one before them,"

@@ -44,6 +44,7 @@ from test_image_lines import cube_of, write_tiff
 from test_imports import write_sbet_file
 from test_pose_tables import HEADWALL, headwall_rows, lcf_rows
 from test_ros2 import flight_of, write_bag
+from test_rtklib import text_of as rtklib_positions
 
 from triline.nodes import config, registry
 from triline.nodes.errors import UserError
@@ -482,6 +483,9 @@ def file_targets(folder: Path) -> list[FileTarget]:
     accuracies = folder / "accuracies.out"  # with a name of its own, so that the SBET alone is read alone
     write_smrmsg(accuracies, np.fromfile(sbet, "<f8")[::17], np.full((50, 3), 0.05), np.full((50, 3), 1e-4))
     whole("SMRMSG", accuracies, partial(_read_all, sbet, detect.Options(accuracies=accuracies)))
+    positions = folder / "day.pos"
+    positions.write_text(rtklib_positions())
+    whole("RTKLIB positions", positions, partial(_read_all, positions))
     small = folder / "small"
     small.mkdir()
     others = small_files(small)
