@@ -49,7 +49,8 @@ TIMES = ("time_s", "start_s", "end_s")
 #: More undetermined combinations than a block with a defect has.
 MANY_WEAK = 30
 
-#: Files beside ``result.json``.
+#: The file that has all of the result, and those beside it.
+RESULT = "result.json"
 TABLES = ("points.csv", "residuals.csv", "trajectory_refined.csv")
 CAMERA, PER_LINE = "camera.json", "orientation_lines.csv"
 #: Sigmas so many times as large as stated are a fault of something else.

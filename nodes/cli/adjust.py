@@ -34,7 +34,17 @@ from ...solver.models.lim import FEWEST_FIXES
 from ...solver.models.platform import MOST_CLOCK_S, MOST_LEVER_ARM_M, USUAL_PLATFORM, PlatformErrors
 from ...solver.partitioned.engine import Engine
 from ...solver.partitioned.part import RAYS
-from ..batch.adjustment_result import CAMERA, HOPELESS, PER_LINE, PLOTS, TABLES, Adjustment, result_of, where_to_look
+from ..batch.adjustment_result import (
+    CAMERA,
+    HOPELESS,
+    PER_LINE,
+    PLOTS,
+    RESULT,
+    TABLES,
+    Adjustment,
+    result_of,
+    where_to_look,
+)
 from ..batch.adjustment_summary import Content, summary_lines
 from ..batch.adjustment_tables import oriented_lines, write_tables
 from ..batch.partition_runner import DaskRunner, FolderStore, ProcessRunner
@@ -48,7 +58,7 @@ from ..formats.dem import surface_control
 from ..formats.importable import refuse_importable
 from ..formats.json_text import json_text
 from ..formats.line_orientation import write_oriented_lines
-from ..formats.new_file import new_file, refuse_unless_folder
+from ..formats.new_file import new_file, new_files, refuse_unless_folder
 from ..formats.scene_block import is_scene_block
 from ..recording.reader import RecordingReader
 from ..recording.remote import path_of
@@ -535,27 +545,24 @@ def write_result(
     """Write the tables, the calibrated camera and ``result.json``; pictures and the table of lines on request.
 
     A ``camera`` that the user gave goes with the tables, calibrated anew or as it is. ``result.json`` comes last: where
-    it is, all is there.
+    it is, all is there. The result of an earlier run stays until all of this one is written.
     """
     refuse_unless_folder(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    if any((folder / name).exists() for name in ("result.json", TABLES[0])):
-        # files of an earlier run, which do not belong to this result
-        for name in ("result.json", *TABLES, *PLOTS, CAMERA, PER_LINE):
-            (folder / name).unlink(missing_ok=True)
-    write_tables(adjustment, folder)
-    used = adjustment.camera() or (None if camera is None else adjustment.block.camera)
-    if used is not None:
-        write_camera(folder / CAMERA, used)
-    if per_line:
-        with new_file(folder / PER_LINE) as part:
-            write_oriented_lines(part, oriented_lines(adjustment), adjustment.block.frame)
-    if plots:
-        from ..report.adjustment_plots import write_plots
+    earlier = any((folder / name).exists() for name in (RESULT, TABLES[0]))
+    with new_files(folder, RESULT, (*TABLES, *PLOTS, CAMERA, PER_LINE) if earlier else ()) as new:
+        write_tables(adjustment, new)
+        used = adjustment.camera() or (None if camera is None else adjustment.block.camera)
+        if used is not None:
+            write_camera(new / CAMERA, used)
+        if per_line:
+            with new_file(new / PER_LINE) as part:
+                write_oriented_lines(part, oriented_lines(adjustment), adjustment.block.frame)
+        if plots:
+            from ..report.adjustment_plots import write_plots
 
-        write_plots(adjustment, folder)
-    with new_file(folder / "result.json") as part:
-        part.write_text(json_text(content) + "\n")
+            write_plots(adjustment, new)
+        with new_file(new / RESULT) as part:
+            part.write_text(json_text(content) + "\n")
 
 
 class _ProgressLines:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.location.refraction import Refraction
+from ..batch.adjustment_result import RESULT
 from ..batch.adjustment_summary import Content
 from ..batch.scene_adjustment import (
     SCENE_CALIBRATIONS,
@@ -22,7 +23,7 @@ from ..batch.scene_adjustment import (
 from ..batch.two_steps import OWNERS, UNUSED
 from ..errors import UserError
 from ..formats.json_text import json_text
-from ..formats.new_file import new_file
+from ..formats.new_file import new_file, new_files
 from ..formats.scene_block import SceneBlockData, read_scene_block
 from .locate import refraction_of
 
@@ -95,14 +96,15 @@ def scene_job(args: argparse.Namespace) -> SceneJob:
 
 
 def write_scene_result(adjustment: SceneAdjustment, content: dict[str, object], folder: Path) -> list[str]:
-    """Write the tables, ``rpc/`` and, last, ``result.json``; returns notes."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for old in [folder / name for name in ("result.json", *TABLES)] + list(folder.glob("rpc/*.RPB")):
-        old.unlink(missing_ok=True)
-    notes = write_scene_tables(adjustment, folder)
-    with_notes = content | {"notes": [*_texts(content["notes"]), *notes]}
-    with new_file(folder / "result.json") as part:
-        part.write_text(json_text(with_notes) + "\n")
+    """Write the tables, ``rpc/`` and, last, ``result.json``; returns notes.
+
+    An earlier result stays until all is written.
+    """
+    with new_files(folder, RESULT, (*TABLES, "rpc/*.RPB")) as new:
+        notes = write_scene_tables(adjustment, new)
+        with_notes = content | {"notes": [*_texts(content["notes"]), *notes]}
+        with new_file(new / RESULT) as part:
+            part.write_text(json_text(with_notes) + "\n")
     return notes
 
 

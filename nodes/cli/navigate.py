@@ -27,7 +27,7 @@ from ...solver.navigation.post_processing import (
 )
 from ..errors import UserError
 from ..formats.json_text import json_text
-from ..formats.new_file import new_file, refuse_unless_folder
+from ..formats.new_file import new_file, new_files, refuse_unless_folder
 from ..formats.recorded_sensors import read_recorded_sensors
 from ..formats.sensor_folder import SensorFolder, read_sensor_folder
 from ..recording.remote import RemotePath, path_of
@@ -36,7 +36,7 @@ from .outputs import refuse_folder_of_inputs
 HELP = "GNSS/inertial filter and smoother over a recording or a sensor folder"
 EXAMPLE = "triline navigate flight_sensors/ -o navigation"
 
-#: What a run writes; those of an earlier run, which do not belong to it, are deleted before.
+#: What a run writes; those of an earlier run, which do not belong to it, stay until all is written.
 TRAJECTORY, PAGE, RESULT = FILES = ("trajectory.csv", "navigation.html", "result.json")
 
 _VALUES = ("lat_deg", "lon_deg", "height_m", "vn_m_s", "ve_m_s", "vd_m_s", "roll_deg", "pitch_deg", "heading_deg")
@@ -108,22 +108,20 @@ def run(args: argparse.Namespace) -> int:
     notes = [*folder.notes, *(folder.named(f) for f in findings)]
     for note in notes:
         _say(quiet, f"note: {note}")
-    out.mkdir(parents=True, exist_ok=True)
-    for name in FILES:  # of an earlier run
-        (out / name).unlink(missing_ok=True)
-    with new_file(out / TRAJECTORY) as part:
-        rows = write_trajectory(part, stretches, inertial, folder, args.rate)
-    result = _result(folder, stretches, inertial, gnss, notes, held_out)
-    result["rows"] = rows
-    if not args.no_page:
-        from ..report.navigation_page import write_page
+    with new_files(out, RESULT, FILES) as new:
+        with new_file(new / TRAJECTORY) as part:
+            rows = write_trajectory(part, stretches, inertial, folder, args.rate)
+        result = _result(folder, stretches, inertial, gnss, notes, held_out)
+        result["rows"] = rows
+        if not args.no_page:
+            from ..report.navigation_page import write_page
 
-        with new_file(out / PAGE) as part:
-            write_page(part, stretches, gnss, result)
-    result["seconds"] = round(time.perf_counter() - began, 3)
-    text = json_text(result)
-    with new_file(out / RESULT) as part:  # the last: where it is, all is there
-        part.write_text(text + "\n", encoding="utf-8")
+            with new_file(new / PAGE) as part:
+                write_page(part, stretches, gnss, result)
+        result["seconds"] = round(time.perf_counter() - began, 3)
+        text = json_text(result)
+        with new_file(new / RESULT) as part:
+            part.write_text(text + "\n", encoding="utf-8")
     if args.json:
         print(text)
     else:

@@ -1,10 +1,11 @@
-"""New files that get their name only when they are complete."""
+"""New files that get their name only when they are complete, alone or together."""
 
 from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -64,3 +65,38 @@ def new_file(target: Path) -> Iterator[Path]:
         raise UserError(f"{target}: cannot be written: {why.lower()}") from None
     finally:
         part.unlink(missing_ok=True)
+
+
+@contextmanager
+def new_files(folder: Path, last: str, old: Iterable[str] = ()) -> Iterator[Path]:
+    """A folder to write a result of several files to, which are moved into ``folder`` when all are complete.
+
+    If something fails before, ``folder`` keeps what it had: the whole result of an earlier run.
+
+    Parameters
+    ----------
+    last : the file that is taken away first and comes last, so that where it is, all is there
+    old : names, or patterns as of `Path.glob`, of files of an earlier result, which are deleted when the new one comes
+
+    Raises
+    ------
+    UserError : a file cannot be written, or its name in ``folder`` is that of a folder or a device
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    part = folder / ".result.part"
+    shutil.rmtree(part, ignore_errors=True)  # of a run that was killed
+    part.mkdir()
+    try:
+        yield part
+        found = [path.relative_to(part) for path in sorted(part.rglob("*")) if path.is_file()]
+        for name in found:
+            refuse_unless_file(folder / name)
+        for path in [folder / last, *(path for pattern in old for path in folder.glob(pattern))]:
+            path.unlink(missing_ok=True)
+        for name in sorted(found, key=lambda name: name == Path(last)):
+            (folder / name).parent.mkdir(exist_ok=True)
+            os.replace(part / name, folder / name)
+    except UserError as error:
+        raise UserError(str(error).replace(os.fspath(part), os.fspath(folder))) from None
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
