@@ -33,7 +33,7 @@ from .ros2_images import ImageTopics
 from .rtklib import is_rtklib
 from .sbet import is_sbet, read_sbet
 from .scene_block import is_scene_block, read_scene_block
-from .scene_images import with_scene_images
+from .scene_images import images_of_scenes, left_out, with_scene_images
 from .scene_recording import local_block
 from .sensor_folder import SensorFolder, positions_alone, read_sensor_folder
 from .sensor_recording import sensor_extent, sensor_fixes, sensor_messages
@@ -217,11 +217,16 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
     options = Options() if options is None else options
     if kind in ("block", "scenes"):
         lines = options.lines is not None
-        block = read_block(path, lines) if kind == "block" else local_block(read_scene_block(path, lines))
+        scenes = read_scene_block(path, lines) if kind == "scenes" else None
+        block = read_block(path, lines) if scenes is None else local_block(scenes)
         notes, messages = [*block.notes, *not_carried(block)], block_messages(block)
-        if options.lines is not None:
-            with_images = with_scene_images if kind == "scenes" else with_block_images
-            messages = with_images(block, messages, options.lines, notes)
+        images = {} if scenes is None else images_of_scenes(path, scenes, block)
+        if options.lines is None:
+            notes += left_out(images)
+        elif scenes is None:
+            messages = with_block_images(block, messages, options.lines, notes)
+        else:
+            messages = with_scene_images(block, messages, options.lines, images, notes)
         return Imported(kind, messages, notes)
     if kind == "ties":
         ties = read_tie_points(path)

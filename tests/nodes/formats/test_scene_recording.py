@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import warnings
 
@@ -17,6 +18,7 @@ from triline.nodes.cli import main
 from triline.nodes.formats.block_recording import block_from_messages
 from triline.nodes.formats.scene_block import read_scene_block
 from triline.nodes.formats.scene_recording import local_block
+from triline.nodes.recording.reader import RecordingReader
 from triline.solver.adjustment.adjustment import adjust
 from triline.solver.adjustment.block_data import network_from_block
 from triline.solver.adjustment.snooping import snoop
@@ -244,6 +246,52 @@ def test_pictures_need_no_image_points(kept, pictures, tmp_path, capsys):
     lines = f"scene/F={pictures / 'F.tif'},scene/B={pictures / 'B.tif'}"
     assert main(["import", str(folder), "--lines", lines, "-o", str(made), "-q"]) == 0
     assert matched_points(made, out) > 40
+
+
+def named_images(pictures, folder, more=""):
+    """A copy of the folder whose scene names its images, as `triline match` wants it; image lines in two bands."""
+    shutil.copytree(pictures / "pair", folder)
+    for name in "FB":
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with rasterio.open(pictures / f"{name}.tif") as image:
+                pixels, profile = image.read(1), image.profile
+            with rasterio.open(folder / f"{name}.tif", "w", **profile | {"count": 2}) as image:
+                image.write(np.stack([np.zeros_like(pixels), pixels]))
+    project = folder / "project.toml"
+    named = f'image = {{ F = "F.tif", B = "B.tif" }}\nband = "2"\n{more}'
+    text, n = re.subn(r"(\[scenes\.\W?scene\W?\]\n)", rf"\1{named}", project.read_text())
+    assert n == 1
+    project.write_text(text)
+    return f"scene/F={folder / 'F.tif'},scene/B={folder / 'B.tif'}"
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_images_that_the_project_names_are_told_and_taken_with_their_band(pictures, tmp_path, capsys):
+    """Nothing said that their lines are missing, and `--lines` took another band than `match`."""
+    folder, made = tmp_path / "pair", tmp_path / "pair.mcap"
+    lines = named_images(pictures, folder)
+    assert main(["import", str(folder), "-o", str(made)]) == 0
+    note = f"images of the scenes are not in the recording: --lines {lines} makes image lines of them"
+    assert note in capsys.readouterr().out
+    assert main(["import", str(folder), "--lines", lines, "-o", str(made)]) == 0
+    assert "makes image lines" not in capsys.readouterr().out
+    sent = RecordingReader(made).sorted_messages(["sensor/lines/F"])
+    with rasterio.open(pictures / "F.tif") as image:
+        np.testing.assert_array_equal(np.concatenate([message.body.pixels for message in sent]), image.read(1))
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_parts_of_scenes_make_no_image_lines(pictures, tmp_path, capsys):
+    folder, made = tmp_path / "pair", tmp_path / "pair.mcap"
+    lines = named_images(pictures, folder, "first_pixel = [0, 10]\n")
+    assert main(["import", str(folder), "-o", str(made)]) == 0
+    said = capsys.readouterr().out
+    assert f"{folder / 'F.tif'}: a part of scene scene/F (first_pixel), of which no image lines can be made" in said
+    assert "--lines" not in said
+    assert main(["import", str(folder), "--lines", lines, "-o", str(made)]) == 1
+    told = f"{folder / 'F.tif'}: a part of scene scene/F (first_pixel), wanted an image of all its lines\n"
+    assert capsys.readouterr().err.endswith(told)
 
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
