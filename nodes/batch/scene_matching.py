@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...solver.geometry.ellipsoid import WGS84
 from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.location.rpc import Rpc
 from ...solver.location.uncertainty import ground_covariance
@@ -16,6 +17,7 @@ from ...solver.matching.scene_patches import SceneView
 from ...solver.matching.scene_ties import ELSEWHERE, PairReport, SceneMatcher, SceneMatching, ScenePoint
 from ..errors import UserError
 from ..formats.matched_points import MatchedLook, write_matched_points
+from ..formats.satellite.read import read_scene
 from ..formats.scene_block import ImageEntry, SceneBlockData
 from .scene_pixels import Tiles, image_of, open_scene_image
 
@@ -26,6 +28,8 @@ Array = NDArray[np.floating]
 SEARCH_M = 50.0
 #: Heights that are thought possible where neither RPC, control nor the user say any, m.
 LOW_M, HIGH_M = -100.0, 3000.0
+#: Polynomials of an image are those of a scene that they are so much nearer to than to its own.
+TAKEN_FOR = 0.1
 #: The ground lies no further below or above control than this, m.
 BEYOND_M = 200.0
 
@@ -75,6 +79,43 @@ def open_views(folder: Path, data: SceneBlockData) -> tuple[SceneBlockData, list
     tiles = Tiles()
     views = [SceneView(e.name, e.location, open_scene_image(path, e, tiles, notes)) for e, path in named]
     return replace(data, images=tuple(entry for entry, _ in named), notes=tuple(notes)), views
+
+
+def mistaken_images(folder: Path, data: SceneBlockData, views: list[SceneView]) -> list[str]:
+    """What is said of images whose own polynomials are those of another scene, as of two that were swapped.
+
+    Parameters
+    ----------
+    data, views : of `open_views`
+    """
+    notes = []
+    for k, entry in enumerate(data.images):
+        path = image_of(folder, entry)
+        assert path is not None
+        try:
+            own = read_scene(path).rpc
+        except UserError:  # most have none
+            continue
+        if own is None:
+            continue
+        first = views[k].pixels.first
+        line, sample = views[k].grid(3).T
+        height = np.full(len(line), own.to_image.in_offset[2])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            said = WGS84.cartesian(*own.direct(line - first[0], sample - first[1], height).T)
+            off = [float(np.linalg.norm(_ground(view, line, sample, height) - said, axis=1).mean()) for view in views]
+        nearest = int(np.nanargmin(off)) if np.isfinite(off).any() else k
+        if off[nearest] < TAKEN_FOR * off[k]:
+            notes.append(
+                f"{path.name}: the polynomials in it or beside it are those of scene {views[nearest].name}, not of "
+                f"{views[k].name}: are these the right images?"
+            )
+    return notes
+
+
+def _ground(view: SceneView, line: Array, sample: Array, height_m: Array) -> Array:
+    """Earth-fixed (n, 3), m, where pixels lie at heights by the model of a view; NaN for none."""
+    return WGS84.cartesian(*view.location.direct(line, sample, height_m).T)
 
 
 def match_scenes(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,11 @@ from ...solver.matching.scene_patches import SceneView
 from ...solver.matching.scene_ties import PairReport
 from ...solver.rectification.pixel_to_cell import meet_terrain
 from ..batch.image_rectification import CACHE_MB
-from ..batch.scene_matching import SEARCH_M, MatchedScenes, match_scenes, open_views, write_points
+from ..batch.scene_matching import SEARCH_M, MatchedScenes, match_scenes, mistaken_images, open_views, write_points
 from ..errors import UserError
 from ..formats.height_raster import DATUMS, HeightRaster
 from ..formats.json_text import json_text
-from ..formats.new_file import refuse_unless_file
+from ..formats.new_file import refuse_unless_writable
 from ..formats.scene_block import SceneBlockData, is_scene_block, read_scene_block
 from .heights_under import height_range, rasters_of_heights
 from .outputs import refuse_over_files
@@ -76,7 +77,10 @@ def run(args: argparse.Namespace) -> int:
 def _matched(args: argparse.Namespace) -> int:
     folder: Path = args.folder
     data, views = open_views(folder, read_scene_block(folder, with_lines=True))
-    notes = list(data.notes)
+    mistaken = mistaken_images(folder, data, views)
+    for note in () if args.quiet or args.json else mistaken:  # at once: what it does to the matches takes its time
+        print(f"note: {note}", file=sys.stderr)
+    notes = [*data.notes, *(mistaken if args.json else ())]
     target = args.table or folder / "image_points.csv"
     rasters = rasters_of_heights(args.dem or ())
     refuse_over_files((target,), [*rasters, *_read_files(folder, data)])
@@ -117,10 +121,7 @@ def _check(args: argparse.Namespace) -> None:
         for name in ("dem_crs", "dem_datum"):
             if getattr(args, name) is not None:
                 raise UserError(f"--{name.replace('_', '-')}: goes with --dem")
-    if args.table is not None:
-        refuse_unless_file(args.table)
-        if not args.table.parent.is_dir():
-            raise UserError(f"{args.table}: no folder {args.table.parent}")
+    refuse_unless_writable(args.table or args.folder / "image_points.csv")
 
 
 def _read_files(folder: Path, data: SceneBlockData) -> list[Path]:

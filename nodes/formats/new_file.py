@@ -23,6 +23,15 @@ def refuse_unless_file(target: Path) -> None:
         raise UserError(f"{target}: is a device, wanted a file")
 
 
+def refuse_unless_writable(target: Path) -> None:
+    """Raise UserError where `new_file` could not write ``target``; called before the work begins."""
+    refuse_unless_file(target)
+    if not target.parent.is_dir():
+        raise UserError(f"{target}: no folder {target.parent}")
+    if not os.access(target.parent, os.W_OK | os.X_OK):
+        raise UserError(f"{target}: cannot be written: no permission in {target.parent}")
+
+
 def refuse_unless_folder(target: Path) -> None:
     """Raise UserError where a folder of results cannot be made; called before the work begins, and makes nothing."""
     place = target

@@ -8,6 +8,7 @@ across the direction, and neighbours along it. The others are looked for near wh
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,8 @@ from .search import COARSEST, REACH_PX, Found, Ground, Patches, find
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
+#: Called with the share of some work that is done.
+Told = Callable[[float], None]
 
 #: Half side of the templates of the wide search, and how far it looks at most, in its own reduced pixels; no less far
 #: than so many full-size ones. Tuned: small templates are found on steep ground, too, and wrong ones do not agree.
@@ -46,6 +49,15 @@ ACROSS_SIGMA, ALONG_SIGMA = 4.0, 6.0
 MOST_FLOORS = 20.0
 #: The wide search is believed if so many places agree, and this share of those that were found.
 FEWEST, LEAST_AGREEING = 5, 0.2
+
+
+def nobody(share: float) -> None:
+    """Who is told where nobody asks."""
+
+
+def part_of(told: Told, begin: float, end: float) -> Told:
+    """Who is told of work that is a part of other work, from one share of that to another."""
+    return lambda share: told(begin + (end - begin) * share)
 
 
 def grids(place: Array, height_m: Array, spacing: float) -> Ground:
@@ -83,7 +95,7 @@ class Pair:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(length > 1e-9, way / length, self.along)
 
-    def find(self, place: Array, height_m: Array, guess: Array, reach_px: float) -> Found:
+    def find(self, place: Array, height_m: Array, guess: Array, reach_px: float, told: Told = nobody) -> Found:
         """`search.find` with shifts and covariances in px of the master."""
         parts = []
         reach = reach_px / self.spacing
@@ -92,6 +104,7 @@ class Pair:
             some = slice(k, k + TOGETHER)
             ground, line = grids(place[some], height_m[some], self.spacing), place[some, 0]
             parts.append(find(master, line, ground, other, guess[some] / self.spacing, line, reach))
+            told(min(k + TOGETHER, len(place)) / len(place))
         return Found(
             np.concatenate([p.shift for p in parts]) * self.spacing,
             np.concatenate([p.covariance for p in parts]) * self.spacing**2,
@@ -141,7 +154,9 @@ class WideSearch:
     step_px: float
 
 
-def wide_search(pair: Pair, place: Array, height_m: Array, across_px: float, along_px: float) -> WideSearch:
+def wide_search(
+    pair: Pair, place: Array, height_m: Array, across_px: float, along_px: float, told: Told = nobody
+) -> WideSearch:
     """Look for places (k, 2) within so many px across the parallax and along it.
 
     Along the parallax heights are tried one after the other, each with a search of its own.
@@ -163,6 +178,7 @@ def wide_search(pair: Pair, place: Array, height_m: Array, across_px: float, alo
     best = np.full(len(place), LEAST_WIDE_SCORE)
     master, other = ScenePatches(pair.master, pair.master), ScenePatches(pair.master, pair.other)
     for k in range(0, len(place), together):
+        told(k / len(place))
         some = np.arange(k, min(k + together, len(place)))
         ground = grids(place[some], height_m[some], s)
         t = master.patches(ground, place[some, 0], WIDE_HALF, factor)
@@ -276,7 +292,7 @@ class Neighbours:
 
 
 def first_neighbours(
-    pair: Pair, place: Array, height_m: Array, across_px: float, most_m: float
+    pair: Pair, place: Array, height_m: Array, across_px: float, most_m: float, told: Told = nobody
 ) -> tuple[Neighbours, float] | None:
     """The wide search among heights up to so many metres beside those given, and its consensus.
 
@@ -285,7 +301,7 @@ def first_neighbours(
     neighbours, and how much higher than given the ground is to be taken (as far as models that are wrong tell), or None
     where too few places agree
     """
-    wide = wide_search(pair, place, height_m, across_px, across_px + most_m * pair.parallax)
+    wide = wide_search(pair, place, height_m, across_px, across_px + most_m * pair.parallax, part_of(told, 0.0, 0.7))
     found = np.asarray(np.isfinite(wide.shift).all(axis=1))
     good = found & crowd(wide.shift @ pair.across, wide.score - LEAST_WIDE_SCORE, 3.0 * wide.step_px)
     good[good] = agreeing(place[good], wide.shift[good], pair.along, 0.5 * wide.step_px)
@@ -295,7 +311,7 @@ def first_neighbours(
     rise_m = min(max(along / max(pair.parallax, 1e-9), -most_m), most_m)
     place, height_m = place[good], height_m[good] + rise_m
     shift = shifts_between(pair, place, height_m, wide.pixel[good])
-    fine = pair.find(place, height_m, shift, max(2.0 * wide.step_px, 4.0 * pair.spacing))
+    fine = pair.find(place, height_m, shift, max(2.0 * wide.step_px, 4.0 * pair.spacing), part_of(told, 0.7, 1.0))
     good = (fine.reason == "") & (fine.score > LEAST_FINE_SCORE)
     way = pair.ways(place[good], height_m[good])
     good[good] = agreeing(place[good], fine.shift[good], way, 0.1 * pair.spacing)

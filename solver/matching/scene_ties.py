@@ -24,10 +24,13 @@ from .scene_search import (
     FEWEST,
     Neighbours,
     Pair,
+    Told,
     agreeing,
     first_neighbours,
     neighbours_of,
+    nobody,
     pair_of,
+    part_of,
     plane_fit,
     shifts_between,
 )
@@ -52,8 +55,13 @@ ROUNDS, AGAIN = 3, ("beyond search", "low correlation", "not converged")
 LEVELS = 5
 #: Pixels of the coarser image of two are larger by this, at least, for it to be the master.
 COARSER = 1.1
-#: Said of images that do not see the same ground.
+#: Said of images that do not see the same ground, and of those that do where no height is known.
 ELSEWHERE = "do not overlap"
+NO_HEIGHT = "no height is known where both may see the ground: the raster has none there (a hole), or ends"
+#: Shares of the work of a pair, about: of its first look, in that of choosing places, and in the rest of the same.
+FIRST_SHARE, FIRST_CHOSEN_SHARE, CHOSEN_SHARE = 0.3, 0.2, 0.3
+#: Shares that are done when each round ends in which places are looked for: few are left after the first.
+ROUND_ENDS = (0.0, 0.8, 0.9, 1.0)
 #: Floor of robust standard deviations, px.
 FLOOR_PX = 0.05
 #: No places.
@@ -177,9 +185,9 @@ class SceneMatcher:
     told : called with the share of the work that is done
     """
 
-    def __init__(self, views: Sequence[SceneView], how: SceneMatching, told: Callable[[float], None] | None = None):
+    def __init__(self, views: Sequence[SceneView], how: SceneMatching, told: Told | None = None):
         self.views, self.how = views, how
-        self._told = told or (lambda share: None)
+        self._told = told or nobody
         self._known: dict[tuple[int, int], _Known | str] = {}
 
     def match(self) -> tuple[list[ScenePoint], list[PairReport]]:
@@ -191,13 +199,14 @@ class SceneMatcher:
             a, b = self._master_first(i, j)
             report = PairReport((a, b), (self.views[a].name, self.views[b].name))
             reports.append(report)
-            known = self._pair(a, b)
+            told = part_of(self._told, number / len(pairs), (number + 1) / len(pairs))
+            known = self._pair(a, b, part_of(told, 0.0, FIRST_SHARE))
             if isinstance(known, str):
                 report.why = known
             else:
                 report.gsd_m, report.overlap = self._gsd(a), float(known.overlap.mean())
-                points += self._points_of(a, b, known, points, report)
-            self._told((number + 1) / len(pairs))
+                points += self._points_of(a, b, known, points, report, part_of(told, FIRST_SHARE, 1.0))
+            told(1.0)
         for report in reports:
             self._tell_misfit(report, points)
         return points, reports
@@ -215,34 +224,46 @@ class SceneMatcher:
     def _master_first(self, i: int, j: int) -> tuple[int, int]:
         return (j, i) if self._gsd(j) > COARSER * self._gsd(i) else (i, j)
 
-    def _pair(self, a: int, b: int) -> _Known | str:
+    def _pair(self, a: int, b: int, told: Told) -> _Known | str:
         """What is known of a pair, found when it is asked for first; in words where there is nothing."""
         if (a, b) not in self._known:
-            self._known[a, b] = self._first_look(a, b)
+            self._known[a, b] = self._first_look(a, b, told)
         return self._known[a, b]
 
-    def _first_look(self, a: int, b: int) -> _Known | str:
+    def _first_look(self, a: int, b: int, told: Told) -> _Known | str:
         """The pair by a wide search with few places, or why there is nothing."""
         master, other, how = self.views[a], self.views[b], self.how
         grid = master.grid(NODES)
         h = how.heights(master, grid)
-        there = np.flatnonzero(np.isfinite(h))
+        there = np.isfinite(h)
+        # where no height is known, that of elsewhere tells whether there is ground that both see
+        h = np.where(there, h, np.median(h[there]) if there.any() else how.middle_m)
         half, seen = 0.5 * (how.high_m - how.low_m), np.zeros(len(grid), dtype=bool)
         for level in np.linspace(-half, half, LEVELS):
-            at = transferred(master, other, grid[there], h[there] + level)
-            seen[there] |= other.inside(at, how.search_m / self._gsd(b))
+            seen |= other.inside(transferred(master, other, grid, h + level), how.search_m / self._gsd(b))
         if not seen.any():
             return ELSEWHERE
+        seen &= there
+        if not seen.any():
+            return NO_HEIGHT
         some = np.flatnonzero(seen)[:: max(int(seen.sum()) // FIRST_PLACES, 1)]
         pair = pair_of(master, other, grid[some], h[some])
-        place = self._best_places(master, self._cells(master, seen, FIRST_PLACES), pair.spacing)
+        place = self._best_places(
+            master, self._cells(master, seen, FIRST_PLACES), pair.spacing, told=part_of(told, 0.0, FIRST_CHOSEN_SHARE)
+        )
+        if not len(place):
+            return "no texture where both may see the ground"
         h = how.heights(master, place)
         place, h = place[np.isfinite(h)], h[np.isfinite(h)]
         if not len(place):
-            return "no texture where both may see the ground"
-        found = first_neighbours(pair, place, h, how.search_m / self._gsd(a), half)
+            return NO_HEIGHT
+        wide = part_of(told, FIRST_CHOSEN_SHARE, 1.0)
+        found = first_neighbours(pair, place, h, how.search_m / self._gsd(a), half, wide)
         if found is None:
-            return "nothing found: the search may be too narrow (--search-m, --height), or they do not see the same"
+            return (
+                "nothing found: the search may be too narrow (--search-m, --height), or they do not see the same; are "
+                f"the images of {master.name} and {other.name} the right ones?"
+            )
         neighbours, rise_m = found
         at = transferred(master, other, grid + neighbours.expected(grid), how.heights(master, grid) + rise_m)
         return _Known(pair, rise_m, neighbours, other.inside(at))
@@ -261,14 +282,16 @@ class SceneMatcher:
         return np.hstack([np.rint(corner), np.minimum(np.rint(corner + side), end)]).astype(np.int64)
 
     def _best_places(
-        self, view: SceneView, cells: NDArray[np.int64], spacing: float, there: Array = NOWHERE, taken: Array = NOWHERE
-    ) -> Array:
+        self, view: SceneView, cells: NDArray[np.int64], spacing: float, there: Array = NOWHERE, taken: Array = NOWHERE,
+        *, told: Told,
+    ) -> Array:  # fmt: skip
         """The place (n, 2) of best texture in each cell without one that is taken, some distance from all there are."""
         half, apart = WINDOW // 2 + 2, round(APART * WINDOW)
         margin = round(MARGIN_PX * spacing)
         first, end = np.array(view.pixels.first) + margin, np.array(view.pixels.end) - margin
         places = np.rint(there)
-        for cell in cells:
+        for number, cell in enumerate(cells):
+            told(number / len(cells))
             low, high = np.maximum(cell[:2], first), np.minimum(cell[2:], end)
             if (high <= low).any() or ((taken >= low) & (taken < high)).all(axis=1).any():
                 continue
@@ -290,24 +313,27 @@ class SceneMatcher:
         return places[len(there) :]
 
     def _points_of(
-        self, a: int, b: int, known: _Known, points: list[ScenePoint], report: PairReport
+        self, a: int, b: int, known: _Known, points: list[ScenePoint], report: PairReport, told: Told
     ) -> list[ScenePoint]:
         """New points that the master and the other image of a pair have, and others, too."""
         master = self.views[a]
         cells = self._cells(master, known.overlap, TRIED * self.how.points)
         there = np.array([p.rays[a][:2] for p in points if a in p.rays]).reshape(-1, 2)
         taken = there[np.array([b in p.rays for p in points if a in p.rays], dtype=bool)]
-        place = self._best_places(master, cells, known.pair.spacing, there, taken)
+        chosen = part_of(told, 0.0, CHOSEN_SHARE)
+        place = self._best_places(master, cells, known.pair.spacing, there, taken, told=chosen)
         report.tried = len(place)
         if not len(place):
             return []
         rays: list[dict[int, tuple[float, float, float]]] = [{} for _ in place]
         own = np.full(len(place), np.nan)
-        for c in [b, *(k for k in range(len(self.views)) if k not in (a, b))]:
-            other = self._pair(a, c)
+        others = [b, *(k for k in range(len(self.views)) if k not in (a, b))]
+        for number, c in enumerate(others):
+            ends = CHOSEN_SHARE + (1.0 - CHOSEN_SHARE) * np.array([number, number + 0.5, number + 1.0]) / len(others)
+            other = self._pair(a, c, part_of(told, *ends[:2].tolist()))
             if isinstance(other, str):
                 continue
-            looks = self._looks_at(other, place)
+            looks = self._looks_at(other, place, part_of(told, *ends[::2].tolist() if c == b else ends[1:].tolist()))
             if c == b:
                 report.found = int(looks.found.sum())
             own = np.fmax(own, np.where(looks.good, looks.own_px, np.nan))
@@ -319,14 +345,14 @@ class SceneMatcher:
             if r
         ]
 
-    def _looks_at(self, known: _Known, place: Array) -> _Looks:
+    def _looks_at(self, known: _Known, place: Array, told: Told) -> _Looks:
         """Look for places (k, 2) of the master in the other image of a pair."""
         how, pair = self.how, known.pair
         h = how.heights(pair.master, place) + known.rise_m
         good, shift = np.zeros(len(place), dtype=bool), np.full((len(place), 2), np.nan)
         covariance, way = np.full((len(place), 2, 2), np.nan), pair.ways(place, h)
         waiting = np.flatnonzero(np.isfinite(h))
-        for _ in range(ROUNDS):
+        for number in range(ROUNDS):
             guess = known.neighbours.expected(place[waiting])
             at, slope = mapping(pair.master, pair.other, place[waiting] + guess, h[waiting])
             edge = MARGIN_PX * np.sqrt(np.abs(np.linalg.det(np.nan_to_num(slope)))) * pair.spacing
@@ -334,7 +360,8 @@ class SceneMatcher:
             k = waiting[seen]
             if not len(k):
                 break
-            found = pair.find(place[k], h[k], guess[seen], known.neighbours.reach_px)
+            part = part_of(told, *ROUND_ENDS[number : number + 2])
+            found = pair.find(place[k], h[k], guess[seen], known.neighbours.reach_px, part)
             fine = verdict(found, how.matching) == ""
             shift[k], covariance[k] = np.where(fine[:, None], found.shift, np.nan), found.covariance
             before = int(good.sum())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -58,7 +59,7 @@ def rows(folder: Path, name: str = "image_points.csv") -> list[dict[str, str]]:
 
 
 def refusal(capsys, *words) -> str:
-    assert main(["match", *map(str, words)]) == 1
+    assert main(["match", "-q", *map(str, words)]) == 1  # progress is told where the machine is slow
     out = capsys.readouterr()
     assert not out.out and out.err.count("\n") == 1 and "fault" not in out.err
     return out.err
@@ -214,6 +215,27 @@ def test_bad_input_is_told_in_one_line(block, tmp_path, capsys):
     text = (block / "project.toml").read_text()
     (block / "project.toml").write_text(text[: text.index("[scenes.aft]")])
     assert "one image, wanted two or more" in refusal(capsys, block)
+
+
+def test_a_folder_that_cannot_be_written_to_is_told_before_the_work(block, capsys, monkeypatch):
+    """It was told when all was matched; as the superuser may write anywhere, access is made up."""
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != block or not mode & os.W_OK)
+    monkeypatch.setattr("triline.nodes.cli.match.open_views", None)
+    told = f"{block / 'image_points.csv'}: cannot be written: no permission in {block}\n"
+    assert refusal(capsys, block) == f"triline match: {told}"
+
+
+def test_images_of_two_scenes_that_were_swapped_are_told(block, capsys):
+    text = (block / "project.toml").read_text()
+    (block / "project.toml").write_text(
+        text.replace('"fore.tif"', '"x"').replace('"aft.tif"', '"fore.tif"').replace('"x"', '"aft.tif"')
+    )
+    assert main(["match", str(block), "--points", "20"]) == 1
+    notes, told = capsys.readouterr().err.rsplit("triline match: ", 1)
+    beside = "the polynomials in it or beside it are those of scene"
+    assert f"note: aft.tif: {beside} aft, not of fore: are these the right images?\n" in notes
+    assert f"note: fore.tif: {beside} fore, not of aft: are these the right images?\n" in notes
+    assert told.endswith("are the images of fore and aft the right ones?\n")
 
 
 def test_an_image_may_be_one_pixel(block, capsys):

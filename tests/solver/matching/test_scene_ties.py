@@ -12,7 +12,7 @@ from triline.solver.location.rpc_fit import fit_to_model
 from triline.solver.matching.options import MatchingOptions
 from triline.solver.matching.scene_patches import ScenePatches, SceneView, mapping, parallaxes, transferred
 from triline.solver.matching.scene_search import agreeing, crowd, grids, pair_of, plane_fit, shifts_between
-from triline.solver.matching.scene_ties import ELSEWHERE, SceneMatcher, SceneMatching
+from triline.solver.matching.scene_ties import ELSEWHERE, NO_HEIGHT, SceneMatcher, SceneMatching
 from triline.solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass, overpass_beside
 
 #: Turned against each other, of other views and other pixel sizes.
@@ -94,7 +94,9 @@ def test_no_place_is_measured_twice_where_a_further_image_does_not_show_it():
 
 def test_points_of_a_pair_in_which_nothing_was_found_by_itself(monkeypatch):
     first = SceneMatcher._first_look
-    monkeypatch.setattr(SceneMatcher, "_first_look", lambda self, a, b: "lost" if b == 1 - a else first(self, a, b))
+    monkeypatch.setattr(
+        SceneMatcher, "_first_look", lambda self, *of: "lost" if of[:2] in ((0, 1), (1, 0)) else first(self, *of)
+    )
     points, reports = SceneMatcher(seen(VIEWS, STATED, 1, 50.0), matching(60)).match()
     assert (reports[0].why, reports[0].tried) == ("lost", 0) and np.isnan(reports[0].misfit_px)
     assert reports[0].kept == sum({0, 1} <= set(p.rays) for p in points) > 10
@@ -123,10 +125,27 @@ def test_known_heights_need_no_search_along_the_parallax():
     views, stated = VIEWS[:2], [moved(VIEWS[0], 3, 0), moved(VIEWS[1], -3, 2)]
     scenes = seen(views, stated, 2, 8.0)
     heights = lambda view, pixel: stated[int(view.name)].on_ground(pixel)[:, 2]  # noqa: E731
-    points, (report,) = SceneMatcher(scenes, matching(40, 15.0, heights)).match()
+    shares: list[float] = []
+    points, (report,) = SceneMatcher(scenes, matching(40, 15.0, heights), shares.append).match()
     off, _, _ = errors_of(views, points)
     assert len(points) > 25 and np.sqrt(np.mean(off**2)) < 0.05
     assert report.kept == len(points)
+    # of large scenes one pair takes minutes
+    assert len(shares) > 50 and shares == sorted(shares) and np.diff(shares).max() < 0.4 and shares[-1] == 1.0
+
+
+def test_ground_without_heights_is_no_lack_of_overlap():
+    """Of a raster with a hole, or one that ends."""
+    views = [VIEWS[0], replace(VIEWS[0], at_m=(150.0, 0.0))]
+    scenes = seen(views, views, 3, 8.0)
+
+    def heights(view, pixel):
+        other = scenes[1 - int(view.name)]
+        lat, lon, h = view.location.direct(*pixel.T, np.full(len(pixel), 240.0)).T
+        return np.where(other.inside(other.location.inverse(lat, lon, h, 1e4), 40.0), np.nan, h)
+
+    points, (report,) = SceneMatcher(scenes, matching(40, 15.0, heights)).match()
+    assert not points and report.why == NO_HEIGHT
 
 
 def test_images_that_see_other_ground_have_no_points():
