@@ -21,6 +21,9 @@ from .track import NavigationTrack, checked
 
 #: Poses of one time that differ by no more are the same one, written twice.
 SAME_M, SAME_RAD = 1e-3, 1e-6
+#: Places in a local frame and latitudes and longitudes beside them are the same within their decimals, m, and the frame
+#: is found in so many rounds at most.
+BESIDE_M, MOST_ROUNDS = 0.01, 10
 #: Quantity -> how files call it, without unit.
 _NAMES = {
     "lat": ("lat", "latitude"),
@@ -31,6 +34,7 @@ _NAMES = {
     "heading": ("heading", "true_heading", "yaw"),
 }
 _NAVIGATION = ("lat_deg", "lon_deg", "height_m", "roll_deg", "pitch_deg", "heading_deg")
+_GEODETIC = _NAVIGATION[:3]
 _OPK = ("omega_deg", "phi_deg", "kappa_deg")
 _PHOTOGRAMMETRIC = (*(place_column(name) for name in PLACE), *(Column(name) for name in _OPK))
 _NED = ("sigma_n_m", "sigma_e_m", "sigma_d_m")
@@ -59,12 +63,14 @@ def read_trajectory_csv(path: Path, crs: str | None = None, day: date | None = N
     Columns are ``lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg`` (or ``lat_rad``, ``Roll [rad]``: names state
     the unit) with optional sigmas as ``triline navigate`` writes them, or ``X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg``
     in the CRS given, where its units may stand in the names (``X_deg``), with optional sigmas along its axes as tables
-    of refined orientation have them (``sigma_X_m`` .. ``sigma_kappa_deg``, empty where they are not known).
+    of refined orientation have them (``sigma_X_m`` .. ``sigma_kappa_deg``, empty where they are not known). Those of a
+    local frame need no CRS where ``lat_deg,lon_deg,height_m`` beside them tell where it lies, as in the table of
+    `write_oriented_lines`; roll, pitch and heading there are of the body, and are not read.
 
     Parameters
     ----------
     path : file
-    crs : of X_m, Y_m, Z_m
+    crs : of X_m, Y_m, Z_m; None or "local" for those of a local frame
     day : of the flight; needed for GPS seconds of the week without a week, compared with all others
 
     Raises
@@ -79,7 +85,8 @@ def read_trajectory_csv(path: Path, crs: str | None = None, day: date | None = N
     photogrammetric = _is_photogrammetric(header)
     names = {} if photogrammetric else _columns(path, header)
     wanted = _PHOTOGRAMMETRIC if photogrammetric else tuple(Column(name) for name in names.values())
-    columns = [*time, *wanted]
+    placed = photogrammetric and crs in (None, "local") and set(_GEODETIC) <= set(header)
+    columns = [*time, *wanted, *(Column(name) for name in _GEODETIC if placed)]
     sigmas = (*_NED, *_RPY) if set(_NED) <= set(header) else tuple(f"{name}_sigma" for name in _NAVIGATION)
     sigmas = _XYZ_OPK if photogrammetric else sigmas
     columns += [Column(name, low=0.0, blank=photogrammetric) for name in sigmas if name in header]
@@ -183,17 +190,20 @@ def _from_crs(
     path: Path, table: Table, crs: str | None, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Latitude, longitude and height (n, 3), roll, pitch and heading (n, 3), and covariances as of a track, or None."""
-    if not crs or crs == "local":
-        raise UserError(f"{path}: X_m, Y_m, Z_m of an unknown CRS, wanted --crs (for example EPSG:32632)")
-    refuse_missing_grids(crs, path)
     xyz, angles = table.stack(*PLACE), np.radians(table.stack(*_OPK))
-    try:
-        frame = LocalFrame.around(xyz, crs)
+    if not crs or crs == "local":
+        frame = _frame_of(path, table, xyz)
         check_place_units(path, table.headed, frame)
-        position = frame.from_crs(xyz)
-        R_l_crs = frame.R_l_crs(xyz)
-    except CrsError as error:
-        raise UserError(f"{path}: {error}") from None
+        position, R_l_crs = xyz, np.tile(np.eye(3), (len(xyz), 1, 1))
+    else:
+        refuse_missing_grids(crs, path)
+        try:
+            frame = LocalFrame.around(xyz, crs)
+            check_place_units(path, table.headed, frame)
+            position = frame.from_crs(xyz)
+            R_l_crs = frame.R_l_crs(xyz)
+        except CrsError as error:
+            raise UserError(f"{path}: {error}") from None
     geodetic, rpy = (
         frame.to_geodetic(position),
         navigation_from_R_lc(frame, position, R_l_crs @ matrix_from_angles(*angles.T)),
@@ -212,3 +222,25 @@ def _from_crs(
     T[:, :3, :3], T[:, 3:, 3:] = R_n_crs, R_n_crs @ np.linalg.inv(angles_jacobian(angles))
     sigma[:, 3:] = np.radians(sigma[:, 3:])
     return geodetic, rpy, T @ (np.square(sigma)[:, :, None] * np.swapaxes(T, 1, 2))
+
+
+def _frame_of(path: Path, table: Table, xyz: np.ndarray) -> LocalFrame:
+    """The local frame of places (n, 3), by latitudes, longitudes and heights in the same rows.
+
+    Raises
+    ------
+    UserError : there are none, or no local frame has these places there
+    """
+    wanted = "wanted --crs (for example EPSG:32632)"
+    if not all(name in table for name in _GEODETIC):
+        beside = f"or of a local frame {', '.join(_GEODETIC)} beside them, as `triline export --per-line` writes"
+        raise UserError(f"{path}: X_m, Y_m, Z_m of an unknown CRS, {wanted}, {beside}")
+    geodetic = table.stack(*_GEODETIC)
+    frame = LocalFrame(*geodetic[0].tolist())
+    for _ in range(MOST_ROUNDS):
+        off = frame.from_geodetic(*geodetic.T) - xyz
+        frame = LocalFrame(*frame.to_geodetic(off.mean(axis=0)).tolist())
+    off = np.abs(frame.from_geodetic(*geodetic.T) - xyz).max()
+    if not off < BESIDE_M:
+        raise UserError(f"{path}: X_m, Y_m, Z_m are in no local frame by {', '.join(_GEODETIC)} beside them, {wanted}")
+    return frame

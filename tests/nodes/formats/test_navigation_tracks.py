@@ -17,13 +17,20 @@ from triline.nodes.formats.avirisc import read_avirisc, utm_zone
 from triline.nodes.formats.avirisng import read_avirisng
 from triline.nodes.formats.detect import kind_of_path, read_any
 from triline.nodes.formats.gps_time import GPS_EPOCH_S, WEEK_S, gps_from_utc_ns, gps_week, unwrap_weeks, utc_ns_from_gps
+from triline.nodes.formats.line_orientation import OrientedLines, write_oriented_lines
 from triline.nodes.formats.pos_export import mapping_frame, read_pos_export
 from triline.nodes.formats.sbet import read_sbet, write_sbet
 from triline.nodes.formats.track import Accuracy, Mounting, NavigationTrack, camera_poses, frame_of, track_messages
 from triline.nodes.formats.trajectory_csv import read_trajectory_csv
 from triline.nodes.recording.reader import RecordingReader
-from triline.solver.geometry.frames import LocalFrame, navigation_from_R_lc
-from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_quaternion
+from triline.solver.geometry.frames import LocalFrame, R_lc_from_navigation, navigation_from_R_lc
+from triline.solver.geometry.rotation import (
+    R_BC_NOMINAL,
+    angles_from_matrix,
+    matrix_from_angles,
+    matrix_from_navigation,
+    matrix_from_quaternion,
+)
 
 AVIRIS_NG = DATA / "avirisng" / "ang20170323t202244_eph_att"
 AVIRIS_C = DATA / "avirisng" / "f180522t01p00r07_eph"
@@ -449,6 +456,40 @@ def test_trajectory_csv_of_both_kinds(tmp_path):
     np.testing.assert_allclose(again.geodetic, track.geodetic, atol=1e-6)
     np.testing.assert_allclose(np.degrees(again.rpy), np.degrees(track.rpy), atol=1e-6)
     with pytest.raises(UserError, match="unknown CRS, wanted --crs"):
+        read_trajectory_csv(path)
+
+
+@pytest.mark.parametrize(("lat", "lon"), [(48.2, 11.2), (-71.0, 179.99)], ids=["north", "date line"])
+def test_lines_in_a_local_frame_come_back_as_they_were(lat, lon, tmp_path):
+    """X .. kappa are of the camera, latitude .. heading of a body to which it is turned: both were refused."""
+    frame, rng, path = LocalFrame(lat, lon, 300.0), np.random.default_rng(1), tmp_path / "lines.csv"
+    position = np.column_stack([np.linspace(-3e4, 6e4, 40), rng.normal(0.0, 500.0, 40), rng.normal(2e3, 9.0, 40)])
+    R = matrix_from_angles(*rng.normal([0.02, -0.05, 1.5], [0.01, 0.01, 2.0], (40, 3)).T)
+    sigma = np.array([0.1, 0.2, 0.4, 1e-4, 2e-4, 4e-4])
+    known = np.tile(np.diag(sigma**2), (40, 1, 1))
+    stamps = ns("2026-05-01T10:00:00") + np.arange(40) * 5_000_000
+    R_bc = matrix_from_navigation(*np.radians([3.0, -2.0, 90.0])) @ R_BC_NOMINAL
+    write_oriented_lines(path, [OrientedLines("S1", np.arange(40), stamps, position, R, known)], frame, R_bc)
+    track = read_trajectory_csv(path)
+    assert np.abs(track.time_ns - stamps).max() < 200  # seconds since 1970 as a number of 16 digits
+    at = frame.from_geodetic(*track.geodetic.T)
+    np.testing.assert_allclose(at, position, atol=2e-4)
+    np.testing.assert_allclose(R_lc_from_navigation(frame, at, track.rpy), R, atol=3e-9)  # 1e-7 degrees
+    north = np.swapaxes(frame.R_ln(at), 1, 2)
+    np.testing.assert_allclose(
+        track.covariance_n[:, :3, :3], north @ known[:, :3, :3] @ np.swapaxes(north, 1, 2), atol=1e-5
+    )
+    assert main(["import", str(path), "-o", str(tmp_path / "lines.mcap"), "-q"]) == 0
+    text = path.read_text()
+    path.write_text(text.replace("X_m,Y_m", "Y_m,X_m"))
+    with pytest.raises(
+        UserError, match="are in no local frame by lat_deg, lon_deg, height_m beside them, wanted --crs"
+    ):
+        read_trajectory_csv(path)
+    path.write_text(text.replace("lat_deg", "lat"))
+    with pytest.raises(
+        UserError, match="or of a local frame lat_deg, lon_deg, height_m beside them, as `triline export"
+    ):
         read_trajectory_csv(path)
 
 
