@@ -66,6 +66,75 @@ class Rectified:
     missed_rays: int = 0
 
 
+#: The poses of a topic.
+_Read = Callable[[str], PoseTable]
+
+
+class OfStrips:
+    """Orientation of each strip of a recording: of one that is imaged beside another one by the poses of its own.
+
+    Parameters
+    ----------
+    name : of `ORIENTATIONS`
+    orientation, reference_ns : from `orientation_of`, for all strips that are imaged alone
+    """
+
+    def __init__(self, recording: Recording, name: str, orientation: LineOrientation, reference_ns: int):
+        self._recording, self._name, self._reference_ns = recording, name, reference_ns
+        self._orientation = orientation
+        self._beside = strips_beside(recording)
+        self._tables: dict[str, PoseTable] = {}
+
+    def __call__(self, strip: str) -> LineOrientation:
+        """Its orientation; times count from the common stamp.
+
+        Raises
+        ------
+        UserError : too few of its poses are valid, or refined ones do not go with measured ones
+        """
+        if strip not in self._beside:
+            return self._orientation
+        own = lambda topic: _own(self._table(topic), strip)  # noqa: E731
+        return _orientation(self._recording, self._name, own, self._reference_ns)[0]
+
+    def _table(self, topic: str) -> PoseTable:
+        if topic not in self._tables:
+            self._tables[topic] = self._recording.poses(topic)
+        return self._tables[topic]
+
+
+def always(orientation: LineOrientation) -> Callable[[str], LineOrientation]:
+    """One orientation for all strips."""
+    return lambda strip: orientation
+
+
+def strips_beside(recording: Recording) -> set[str]:
+    """The strips that are imaged while another one is, as by two cameras with line rates of their own."""
+    spans = []
+    for id, strip in recording.last_strips().items():
+        if strip.line_rate_hz > 0:
+            lines = int(strip.lines) or _under_poses(recording, strip)
+            first_ns = int(strip.first_line_time_ns)
+            spans.append((first_ns, first_ns + max(lines - 1, 0) / strip.line_rate_hz * 1e9, id))
+    found: set[str] = set()
+    last_ns, last = -np.inf, ""
+    for begin_ns, end_ns, id in sorted(spans):
+        if begin_ns < last_ns:
+            found |= {last, id}
+        if end_ns > last_ns:
+            last_ns, last = end_ns, id
+    return found
+
+
+def _own(table: PoseTable, strip: str) -> PoseTable:
+    """Poses without those of other strips from the first to the last valid one of a strip; all where it has none."""
+    own = np.asarray(table.strip == strip)
+    times = table.time_ns[own & table.valid]
+    if not len(times):
+        return table
+    return table.part(own | (table.time_ns < times.min()) | (table.time_ns > times.max()))
+
+
 def orientation_of(recording: Recording, name: str | None) -> tuple[str, LineOrientation, int]:
     """The orientation of a recording: which it is, the orientation, and the stamp (ns) that its times count from.
 
@@ -96,21 +165,29 @@ def orientation_of(recording: Recording, name: str | None) -> tuple[str, LineOri
         has = f"it has {', '.join(there)}" if there else "it has none"
         missing = ORIENTATIONS[name].rstrip("/") if measured or name == "measured" else "trajectory"
         raise UserError(f"{path}: no {name} orientation ({missing}): {has}; 'triline process' makes it")
-    stated = _poses(recording, "truth/trajectory") if name == "truth" else _measured(recording, name != "live")
+    return name, *_orientation(recording, name, recording.poses)
+
+
+def _orientation(
+    recording: Recording, name: str, read: _Read, reference_ns: int | None = None
+) -> tuple[LineOrientation, int]:
+    """`orientation_of` by poses that are read in a certain way; without a stamp times count from the first of them."""
+    path = recording.reader.path
+    stated = _poses(read, "truth/trajectory") if name == "truth" else _measured(read, name != "live")
     base = stated.part(stated.valid)
     not_valid = len(stated.time_ns) - len(base.time_ns)
     if len(base.time_ns) < 2:
         kind = "true" if name == "truth" else "measured"
         raise UserError(f"{path}: {len(base.time_ns)} valid poses of the {kind} trajectory, wanted at least 2")
-    reference_ns = int(base.time_ns[0])
+    reference_ns = int(base.time_ns[0]) if reference_ns is None else reference_ns
     gap_s = max(0.3, 2.5 * float(np.median(np.diff(base.time_ns))) * 1e-9)
     orientation = LineOrientation((base.time_ns - reference_ns) * 1e-9, base.position_l, base.quaternion, gap_s)
     orientation.not_valid = not_valid
     if name in REFINED:
         # whole strips come again when the block is refined with later ones; live is the first answer
-        refined = _poses(recording, ORIENTATIONS[name], keep_first=name == "live")
-        if name == "whole" and "orientation/final" in held:  # of a strip whose backward pass is missing
-            refined = _with_final(recording, refined)
+        refined = _poses(read, ORIENTATIONS[name], keep_first=name == "live")
+        if name == "whole":
+            refined = _with_final(read, refined)
         refined = refined.part(refined.valid)
         try:
             orientation.refine((refined.time_ns - reference_ns) * 1e-9, refined.position_l, refined.quaternion)
@@ -121,28 +198,28 @@ def orientation_of(recording: Recording, name: str | None) -> tuple[str, LineOri
         orientation.state_covariance([0.0], np.zeros((1, 6, 6)))
     elif np.isfinite(base.covariance).all(axis=(1, 2)).any():
         orientation.state_covariance((base.time_ns - reference_ns) * 1e-9, base.covariance)
-    return name, orientation, reference_ns
+    return orientation, reference_ns
 
 
-def _poses(recording: Recording, topic: str, keep_first: bool = False) -> PoseTable:
-    return recording.poses(topic).one_a_time(keep_first)
+def _poses(read: _Read, topic: str, keep_first: bool = False) -> PoseTable:
+    return read(topic).one_a_time(keep_first)
 
 
-def _measured(recording: Recording, smoothed: bool) -> PoseTable:
+def _measured(read: _Read, smoothed: bool) -> PoseTable:
     """Filtered poses or smoothed ones, and the others before the first of them that is valid and behind the last."""
     topics = (
         ("trajectory/smoothed", "trajectory/filtered") if smoothed else ("trajectory/filtered", "trajectory/smoothed")
     )
-    poses, more = (_poses(recording, topic) for topic in topics)
+    poses, more = (_poses(read, topic) for topic in topics)
     valid = poses.time_ns[poses.valid]
     if not len(valid):
         return more if more.valid.any() else poses
     return _joined(poses, more, (more.time_ns < valid[0]) | (more.time_ns > valid[-1]))
 
 
-def _with_final(recording: Recording, whole: PoseTable) -> PoseTable:
-    """Poses of whole strips, and the final ones of strips that have none."""
-    final = recording.poses("orientation/final")
+def _with_final(read: _Read, whole: PoseTable) -> PoseTable:
+    """Poses of whole strips, and the final ones of strips that have none: of those whose backward pass is missing."""
+    final = read("orientation/final")
     return _joined(whole, final, ~np.isin(final.strip, whole.strip))
 
 
@@ -201,19 +278,20 @@ def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Ite
     strips = {id: strip for id, strip in recording.last_strips().items() if strip.line_rate_hz > 0}
     if not strips:
         raise UserError(f"{recording.reader.path}: no strip in it, so no lines (configuration/strip)")
-    stated = name in REFINED and orientation.has_covariance
+    of_strip = OfStrips(recording, name, orientation, reference_ns)
 
     def parts() -> Iterator[OrientedLines]:
         for strip in strips.values():
             stamps = _line_stamps(recording, strip)
             time_s = (stamps - reference_ns) * 1e-9
-            known = np.flatnonzero(orientation.covers(time_s))
+            own = of_strip(strip.id)
+            known = np.flatnonzero(own.covers(time_s))
             if not len(known):
                 continue
-            position, R = orientation.at(time_s[known])
+            position, R = own.at(time_s[known])
             covariance = np.full((len(known), 6, 6), np.nan)
-            if stated:
-                covariance = orientation.covariance_at(time_s[known])
+            if name in REFINED and own.has_covariance:
+                covariance = own.covariance_at(time_s[known])
             yield OrientedLines(strip.id, known, stamps[known], position, R, covariance)
 
     return name, parts(), orientation.not_valid
@@ -335,7 +413,7 @@ class Rectification:
     ----------
     camera, ccd : camera, and the index of its CCD line
     surface, grid, resampling : as in `StripRectifier`
-    orientation, reference_ns : of the lines
+    orientation, reference_ns : of the lines of a strip, by its name, and what its times count from
     factor : pixels that are put together to one, along and across, where cells are that much larger
     errors : besides those of the orientation; then the orthoimage has sigmas
     mosaic : makes what the cells go into, from the data type of the lines
@@ -343,7 +421,8 @@ class Rectification:
 
     def __init__(
         self, camera: LineCamera, ccd: int, surface: Surface, grid: GroundGrid, resampling: str,
-        orientation: LineOrientation, reference_ns: int, factor: int = 1, errors: GroundErrors | None = None,
+        orientation: Callable[[str], LineOrientation], reference_ns: int, factor: int = 1,
+        errors: GroundErrors | None = None,
         mosaic: Callable[[np.dtype], Mosaic] = Mosaic,
     ) -> None:  # fmt: skip
         self._mosaic = mosaic
@@ -360,6 +439,7 @@ class Rectification:
         self.result: Rectified | None = None
         self._strip = ""
         self._rectifier: StripRectifier | None = None
+        self._of_strip: LineOrientation | None = None
         self._next_line = 0
         self._rest: tuple[NDArray[Any], NDArray[np.bool_], Array] | None = None
 
@@ -374,7 +454,7 @@ class Rectification:
             self.result = Rectified(self._mosaic(block.pixels.dtype))
         if block.strip != self._strip:
             self._close()
-            self._strip = block.strip
+            self._strip, self._of_strip = block.strip, self.orientation(block.strip)
             self._rectifier = StripRectifier(self.rays, self.surface, self.grid, self.resampling, errors=self.errors)
             self._next_line = int(block.first_line)
         pixels, first = block.pixels, int(block.first_line)
@@ -420,13 +500,13 @@ class Rectification:
             self._place(small, together, time_s[:used].reshape(n, f).mean(axis=1), first // f)
 
     def _place(self, pixels: NDArray[Any], usable: NDArray[np.bool_], time_s: Array, first: int) -> None:
-        assert self.result is not None and self._rectifier is not None
-        known = self.orientation.covers(time_s)
+        assert self.result is not None and self._rectifier is not None and self._of_strip is not None
+        known = self._of_strip.covers(time_s)
         self._leave_out("without orientation", self.factor * int((usable & ~known).sum()))
         edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
         for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-            position, R = self.orientation.at(time_s[begin:end])
-            Q = None if self.errors is None else self.orientation.covariance_at(time_s[begin:end])
+            position, R = self._of_strip.at(time_s[begin:end])
+            Q = None if self.errors is None else self._of_strip.covariance_at(time_s[begin:end])
             for patch in self._rectifier.add(first + begin, pixels[begin:end], usable[begin:end], position, R, Q):
                 self.result.mosaic.add(patch)
             lines = self.factor * int(usable[begin:end].sum())

@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
     recording, camera, ccd, name = of.recording, of.camera, of.ccd, of.orientation_name
     ground, grid, factor = of.ground, *cells_of(args, of)
     work = Rectification(
-        camera, ccd, of.surface, grid, args.resampling, of.orientation, of.reference_ns, factor, of.errors
+        camera, ccd, of.surface, grid, args.resampling, of.of_strip, of.reference_ns, factor, of.errors
     )
     with progress("rectifying", args.quiet or args.json) as told:
         for block in line_blocks(recording, camera.lines[ccd].id, args.strip, told):

@@ -411,7 +411,7 @@ def _layer_of_strip(
         return held[0]
 
     work = Rectification(
-        of.camera, of.ccd, of.surface, grid, args.resampling, of.orientation, of.reference_ns, factor, of.errors, mosaic
+        of.camera, of.ccd, of.surface, grid, args.resampling, of.of_strip, of.reference_ns, factor, of.errors, mosaic
     )
     ccd = of.camera.lines[of.ccd].id
     stamps: list[int] = []

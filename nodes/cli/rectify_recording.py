@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from ...solver.orthoimage.orientation import LineOrientation
 from ...solver.orthoimage.surface import Ellipsoid, Surface, UnderAir
 from ..batch.rectification import (
     REFINED,
+    OfStrips,
+    always,
     camera_beside,
     estimated_camera,
     frame_for,
@@ -46,6 +49,7 @@ class Prepared:
     ----------
     camera, ccd : camera, and the index of its CCD line
     orientation_name, orientation, reference_ns : of the lines
+    of_strip : orientation of each strip, by its name
     estimated, of_camera : how many parameters of the camera were estimated; the file of the camera, if it has one
     target : the local frame with the CRS of the cells
     surface, ground : what rays meet, and its name
@@ -60,6 +64,7 @@ class Prepared:
     orientation_name: str
     orientation: LineOrientation
     reference_ns: int
+    of_strip: Callable[[str], LineOrientation]
     estimated: int
     of_camera: Path | None
     target: LocalFrame
@@ -87,10 +92,12 @@ def prepared(args: argparse.Namespace, path: Path) -> Prepared:
     if args.trajectory is not None:
         name = args.trajectory.name
         orientation, reference_ns = trajectory_orientation(recording, args.trajectory)
+        of_strip = always(orientation)
         if args.camera is None:
             camera, of_camera = camera_beside(args.trajectory, camera, notes)
     else:
         name, orientation, reference_ns = orientation_of(recording, args.orientation)
+        of_strip = OfStrips(recording, name, orientation, reference_ns)
     estimated = 0
     if args.camera is not None:
         camera, of_camera = read_camera_instead(args.camera, camera, notes=notes), args.camera
@@ -107,8 +114,8 @@ def prepared(args: argparse.Namespace, path: Path) -> Prepared:
     if above <= 0:
         raise UserError(f"{path}: the camera is {-above:.0f} m below the ground; wanted another --height or --dem")
     return Prepared(
-        recording, camera, ccd, name, orientation, reference_ns, estimated, of_camera, target, surface, ground, errors,
-        pixel_on_ground(camera, ccd, above), tuple(notes),
+        recording, camera, ccd, name, orientation, reference_ns, of_strip, estimated, of_camera, target, surface,
+        ground, errors, pixel_on_ground(camera, ccd, above), tuple(notes),
     )  # fmt: skip
 
 

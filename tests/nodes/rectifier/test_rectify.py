@@ -10,6 +10,7 @@ from datetime import datetime
 from decimal import Decimal
 
 import numpy as np
+import pandas as pd
 import pytest
 import rasterio
 import rasterio.warp
@@ -132,7 +133,7 @@ def test_roads_become_straight(flown, simulated):
     off = {}
     for name in ("measured", "final", "truth"):
         _, orientation, reference_ns = work.orientation_of(recording, name)
-        job = work.Rectification(camera, 1, field, grid, "bilinear", orientation, reference_ns)
+        job = work.Rectification(camera, 1, field, grid, "bilinear", work.always(orientation), reference_ns)
         for block in work.line_blocks(recording, "N", None):
             job.add(block)
         done = job.finish()
@@ -223,6 +224,39 @@ def test_no_line_of_a_table_is_left_out_for_the_rounding_of_its_time(flown, fold
     table.write_text("".join(",".join(row) + "\n" for row in rows))
     told = _rectify(capsys, flown, folder / "rounded.tif", "--trajectory", table, "--height", 0)
     assert told["strips"] == {"S1": len(rows) - 1} and not told["left_out"]
+
+
+def test_lines_have_the_poses_of_their_own_strip_where_two_are_imaged_at_the_same_time(flown, folder, capsys):
+    """Of a time one pose was taken, whichever strip it is of."""
+    recording, beside = Recording(flown), folder / "beside.mcap"
+    with RecordingWriter(beside) as writer:
+        for message in recording.messages():
+            writer.write(message)
+            if message.topic == "configuration/strip":
+                other = m.Strip.FromString(message.body.SerializeToString())
+                other.id, other.line_rate_hz, other.lines = "S2", 0.5 * other.line_rate_hz, other.lines // 2
+                writer.write(replace(message, body=other))
+            elif message.topic in ("orientation/final", "orientation/whole"):
+                pose = m.PoseInFrame.FromString(message.body.SerializeToString())
+                pose.strip, pose.pose.position.x = "S2", pose.pose.position.x + 100.0
+                writer.write(replace(message, body=pose))
+    tables = {}
+    for path in (flown, beside):
+        table = folder / f"{path.stem}_lines.csv"
+        assert main(["export", str(path), "--per-line", str(table), "-q"]) == 0
+        tables[path] = {strip: rows for strip, rows in pd.read_csv(table).groupby("strip")}
+    alone, own, other = tables[flown]["S1"], tables[beside]["S1"], tables[beside]["S2"]
+    np.testing.assert_array_equal(own.to_numpy(), alone.to_numpy())
+    n = min(len(other), len(alone) // 2)  # each second line at the same time
+    off = other[["X_m", "Y_m", "Z_m"]].to_numpy()[:n] - alone[["X_m", "Y_m", "Z_m"]].to_numpy()[::2][:n]
+    assert n > 200 and np.linalg.norm(off, axis=1) == pytest.approx(np.full(n, 100.0), abs=0.1)  # scale of the CRS
+    images = []
+    for path in (flown, beside):
+        _rectify(capsys, path, folder / "strip.tif", "--strip", "S1", "--gsd", 8, "--height", 0)
+        with rasterio.open(folder / "strip.tif") as image:
+            images.append((image.read(1), image.transform))
+    np.testing.assert_array_equal(images[1][0], images[0][0])
+    assert images[1][1] == images[0][1]
 
 
 def test_parameters_of_other_things_than_the_camera_do_not_hide_those_of_the_camera(flown, folder):
