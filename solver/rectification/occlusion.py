@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 from ..geometry.ellipsoid import Ellipsoid
 from .cell_to_pixel import HeightsOfTile
@@ -40,7 +41,7 @@ def hidden(
     knots = [_knots(n, axis, heights) for axis, n in enumerate(inside.shape)]
     net = np.ix_(*knots)
     N = np.broadcast_to(heights.undulation, inside.shape)[net]
-    clear = _clearance(heights.values, N, heights.row[net], heights.column[net], heights.height_m[net], along[net])
+    clear = clearance(heights.values, N, heights.row[net], heights.column[net], heights.height_m[net], along[net])
     if clear.shape == inside.shape:
         return inside & (clear < -CLEAR_M)
     place = np.ix_(*[np.interp(np.arange(n), k, np.arange(len(k))) for n, k in zip(inside.shape, knots, strict=True)])
@@ -57,16 +58,25 @@ def _knots(length: int, axis: int, heights: HeightsOfTile) -> NDArray[np.intp]:
     return np.unique(np.append(np.arange(0, length - 1, apart), length - 1))
 
 
-def _clearance(
+def clearance(
     values: NDArray[np.float32], N: Array, row: Array, column: Array, h: Array, along: Array
 ) -> NDArray[np.float32]:
-    """How far rays stay above the ground on their way to the sensor (...), metres; below zero where they do not."""
+    """How far rays stay above the ground on their way to the sensor (...), metres; below zero where they do not.
+
+    Parameters
+    ----------
+    values : (m, k) heights of the ground, metres; NaN, which hides nothing, where none is known
+    N : (...) height that these count from, in the system of ``h``, metres
+    row, column : (...) places in ``values`` where the rays meet the ground
+    h : (...) heights there, metres; NaN for rays that nothing is asked of
+    along : (..., 2) change of row and column a metre of height along the rays
+    """
     shape = h.shape
     row, column, h, N = (np.ravel(a).astype(np.float32) for a in (row, column, h, N))
     by_row, by_column = along[..., 0].ravel(), along[..., 1].ravel()
     out = np.full(h.shape, np.inf, dtype=np.float32)
-    top = np.float32(np.nanmax(values)) + N
     speed = float(np.hypot(by_row, by_column).max())
+    top = _tops(values, row, column, h - N, speed) + N
     left = np.flatnonzero(np.isfinite(h) & (h < top))
     step = STEP_CELLS / speed if speed > 0 else np.inf
     up = np.float32(0.0)
@@ -78,6 +88,28 @@ def _clearance(
         left = left[h[left] + up < top[left]]
     # above the highest ground everywhere: a number that can be carried between cells
     return np.minimum(out, np.float32(1e4)).reshape(shape)
+
+
+def _tops(values: NDArray[np.float32], row: Array, column: Array, h: Array, speed: float) -> NDArray[np.float32]:
+    """Highest ground (n,) that rays from places (n,) and heights (n,) may meet on their way up, metres.
+
+    ``speed`` : cells of the raster that they move at most a metre of height
+    """
+    highest, rows, columns = np.float32(np.nanmax(values)), *values.shape
+    low = np.nanmin(h) if np.isfinite(h).any() else highest
+    side = int(np.ceil(speed * max(float(highest - low), 0.0))) + 2
+    if 4 * side > max(rows, columns):
+        return np.full(row.shape, highest, dtype=np.float32)
+    # of squares as wide as the longest way, and of those around
+    tops = np.where(np.isnan(values), -np.inf, values)
+    for axis, size in enumerate((rows, columns)):
+        tops = np.maximum.reduceat(tops, np.arange(0, size, side), axis=axis)
+    tops = maximum_filter(tops, size=3, mode="nearest")
+    at = (
+        np.clip(np.nan_to_num(a) // side, 0, n - 1).astype(np.intp)
+        for a, n in zip((row, column), tops.shape, strict=True)
+    )
+    return tops[tuple(at)]
 
 
 def place_slopes(terrain: Terrain, lat: Array, lon: Array, height_m: Array, ellipsoid: Ellipsoid) -> Array:
