@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from ...solver.orthoimage.ground_grid import GroundGrid, utm_of
 from ...solver.orthoimage.heights_of_points import heights_of_points
 from ...solver.orthoimage.mosaic import Mosaic
 from ...solver.orthoimage.orientation import SAME_S, LineOrientation
-from ...solver.orthoimage.strip import StripRectifier, rays_of
+from ...solver.orthoimage.strip import Shadows, StripRectifier, rays_of
 from ...solver.orthoimage.surface import HeightField, Surface
 from ...solver.simulation.flight import Flight
 from .. import convert
@@ -58,12 +59,14 @@ class Rectified:
     strips : lines of each strip that went into it
     left_out : lines that did not, by reason
     missed_rays : rays that did not meet the ground
+    hidden_cells : cells that were left out because the relief hides them, of each strip
     """
 
     mosaic: Mosaic
     strips: dict[str, int] = field(default_factory=dict)
     left_out: dict[str, int] = field(default_factory=dict)
     missed_rays: int = 0
+    hidden_cells: int = 0
 
 
 #: The poses of a topic.
@@ -94,13 +97,13 @@ class OfStrips:
         """
         if strip not in self._beside:
             return self._orientation
-        own = lambda topic: _own(self._table(topic), strip)  # noqa: E731
-        return _orientation(self._recording, self._name, own, self._reference_ns)[0]
+        return _orientation(self._recording, self._name, partial(self._poses, strip), self._reference_ns)[0]
 
-    def _table(self, topic: str) -> PoseTable:
+    def _poses(self, strip: str, topic: str) -> PoseTable:
+        """Those of a topic that are of a strip."""
         if topic not in self._tables:
             self._tables[topic] = self._recording.poses(topic)
-        return self._tables[topic]
+        return _own(self._tables[topic], strip)
 
 
 def always(orientation: LineOrientation) -> Callable[[str], LineOrientation]:
@@ -417,15 +420,16 @@ class Rectification:
     factor : pixels that are put together to one, along and across, where cells are that much larger
     errors : besides those of the orientation; then the orthoimage has sigmas
     mosaic : makes what the cells go into, from the data type of the lines
+    shadows : what the relief hides is left out; None = it shows what is seen beside it
     """
 
     def __init__(
         self, camera: LineCamera, ccd: int, surface: Surface, grid: GroundGrid, resampling: str,
         orientation: Callable[[str], LineOrientation], reference_ns: int, factor: int = 1,
-        errors: GroundErrors | None = None,
-        mosaic: Callable[[np.dtype], Mosaic] = Mosaic,
+        errors: GroundErrors | None = None, mosaic: Callable[[np.dtype], Mosaic] = Mosaic,
+        shadows: Shadows | None = None,
     ) -> None:  # fmt: skip
-        self._mosaic = mosaic
+        self._mosaic, self.shadows = mosaic, shadows
         line = camera.lines[ccd]
         if line.pixels // factor < 2 <= line.pixels:
             most = grid.gsd / factor * (line.pixels // 2)
@@ -455,7 +459,9 @@ class Rectification:
         if block.strip != self._strip:
             self._close()
             self._strip, self._of_strip = block.strip, self.orientation(block.strip)
-            self._rectifier = StripRectifier(self.rays, self.surface, self.grid, self.resampling, errors=self.errors)
+            self._rectifier = StripRectifier(
+                self.rays, self.surface, self.grid, self.resampling, errors=self.errors, shadows=self.shadows
+            )
             self._next_line = int(block.first_line)
         pixels, first = block.pixels, int(block.first_line)
         time_s = (block.times_ns() - self.reference_ns) * 1e-9
@@ -522,6 +528,7 @@ class Rectification:
             for patch in self._rectifier.finish():
                 self.result.mosaic.add(patch)
             self.result.missed_rays += self._rectifier.missed
+            self.result.hidden_cells += self._rectifier.hidden
         self._rectifier = self._rest = None
 
     def finish(self) -> Rectified | None:

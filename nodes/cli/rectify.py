@@ -29,7 +29,7 @@ EXAMPLE = """triline rectify flight.mcap -o ortho.tif
   triline rectify day1.mcap day2.mcap --mosaic --dem heights.tif --sigma sigma.tif --workers 4 -o block.tif"""
 
 #: Options of an image that a recording takes, too.
-_OF_BOTH = ("dem_crs", "refraction", "sigma", "pixel_sigma", "height_sigma")
+_OF_BOTH = ("dem_crs", "refraction", "occlusions", "sigma", "pixel_sigma", "height_sigma")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -93,8 +93,9 @@ def run(args: argparse.Namespace) -> int:
     recording, camera, ccd, name = of.recording, of.camera, of.ccd, of.orientation_name
     ground, grid, factor = of.ground, *cells_of(args, of)
     work = Rectification(
-        camera, ccd, of.surface, grid, args.resampling, of.of_strip, of.reference_ns, factor, of.errors
-    )
+        camera, ccd, of.surface, grid, args.resampling, of.of_strip, of.reference_ns, factor, of.errors,
+        shadows=of.shadows,
+    )  # fmt: skip
     with progress("rectifying", args.quiet or args.json) as told:
         for block in line_blocks(recording, camera.lines[ccd].id, args.strip, told):
             try:
@@ -119,6 +120,7 @@ def run(args: argparse.Namespace) -> int:
         "gsd": grid.gsd, "ground": ground, "resampling": args.resampling, "rows": shape[0], "columns": shape[1],
         "pixels_together": factor, "camera_parameters": of.estimated, "camera": of.of_camera and str(of.of_camera),
         "sigma": args.sigma, "strips": done.strips, "left_out": done.left_out, "missed_rays": done.missed_rays,
+        "hidden_cells": done.hidden_cells if args.occlusions else None,
         "poses_not_valid": of.orientation.not_valid,
         "notes": [*of.notes, *notes_of_map(grid.frame.crs, project_frame(recording).crs)],
         "seconds": round(time.perf_counter() - begun, 3),
@@ -158,6 +160,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UserError(f"--dem-crs {args.dem_crs}: is of a raster of heights, wanted --dem FILE with it")
     if args.dem is not None and args.height is not None:
         raise UserError("--height and --dem: wanted one of them")
+    rectify_image.refuse_occlusions_of_level_ground(args)
     if args.dem is not None and len(args.dem) > 1:
         raise UserError("--dem: given more than once, which goes with --sensor only")
     if args.resampling not in TAPS:
@@ -190,6 +193,8 @@ def _tell(result: dict[str, Any], done: Rectified, args: argparse.Namespace, uni
         print(f"  {result['poses_not_valid']} poses are not valid and give no orientation")
     if done.missed_rays:
         print(f"  {done.missed_rays} rays did not meet the ground")
+    if args.occlusions:
+        print(f"  {done.hidden_cells} cells hidden by relief")
     if not args.quiet:
         for note in result["notes"]:
             print(f"  note: {note}")

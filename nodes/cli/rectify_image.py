@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options that go with an image."""
     group = parser.add_argument_group(
         "an image of a sensor (with --sensor)",
-        "--refraction, --sigma, --pixel-sigma, --height-sigma and --dem-crs go with a recording, too",
+        "--refraction, --occlusions, --sigma, --pixel-sigma, --height-sigma and --dem-crs go with a recording, too",
     )
     group.add_argument(
         "--sensor", metavar="META", action="append",
@@ -209,8 +209,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UserError(f"--height {args.height}: wanted a number")
     if args.dem and args.height is not None:
         raise UserError("--height and --dem: wanted one of them")
-    if args.occlusions and not args.dem:
-        raise UserError("--occlusions: goes with --dem, without which no ground is higher than another")
+    refuse_occlusions_of_level_ground(args)
     if args.correction is not None and args.control is None:
         raise UserError(f"--correction {args.correction}: goes with --control CSV, whose points it is found by")
     if args.direct and (args.sigma or args.occlusions):
@@ -233,6 +232,12 @@ def _check(args: argparse.Namespace) -> None:
         raise UserError("--plain and --compress: wanted one of them")
     if args.workers is not None and args.workers < 1:
         raise UserError(f"--workers {args.workers}: wanted at least 1")
+
+
+def refuse_occlusions_of_level_ground(args: argparse.Namespace) -> None:
+    """Refuse --occlusions where no ground is higher than another."""
+    if args.occlusions and not args.dem:
+        raise UserError("--occlusions: goes with --dem, without which no ground is higher than another")
 
 
 # -- the sensor ----------------------------------------------------------------------------------------------------

@@ -65,9 +65,9 @@ _RECORDINGS = (".mcap",)
 _NOT_OF_MOSAIC = ("trajectory", "control", "correction", "first_pixel", "mask", "bounds", "direct", "plain")
 
 #: Options without effect where the inputs have no image with its metadata, no recording, or neither of them.
-_OF_IMAGES = ("model", "dem_datum", "nodata", "occlusions", "position_sigma", "attitude_sigma")
+_OF_IMAGES = ("model", "dem_datum", "nodata", "position_sigma", "attitude_sigma")
 _OF_RECORDINGS = ("orientation", "camera", "strip")
-_OF_BOTH = ("dem", "dem_crs", "height", "refraction", "ccd", "pixel_sigma", "height_sigma")
+_OF_BOTH = ("dem", "dem_crs", "height", "occlusions", "refraction", "ccd", "pixel_sigma", "height_sigma")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -228,6 +228,7 @@ def _refuse_without_effect(args: argparse.Namespace, kinds: set[str]) -> None:
         for name in names:
             if rectify_image.is_given(args, name) and not kinds & wanted:
                 raise UserError(f"--{name.replace('_', '-')}: goes with {words}, and there is none")
+    rectify_image.refuse_occlusions_of_level_ground(args)
     if args.sigma is None:
         for name in ("position_sigma", "attitude_sigma", "pixel_sigma", "height_sigma"):
             if rectify_image.is_given(args, name):
@@ -411,8 +412,9 @@ def _layer_of_strip(
         return held[0]
 
     work = Rectification(
-        of.camera, of.ccd, of.surface, grid, args.resampling, of.of_strip, of.reference_ns, factor, of.errors, mosaic
-    )
+        of.camera, of.ccd, of.surface, grid, args.resampling, of.of_strip, of.reference_ns, factor, of.errors,
+        mosaic, of.shadows,
+    )  # fmt: skip
     ccd = of.camera.lines[of.ccd].id
     stamps: list[int] = []
     for block in line_blocks(of.recording, ccd, [strip]):
@@ -430,7 +432,8 @@ def _layer_of_strip(
             name=name, camera=_camera_name(of.camera, of.ccd),
             told={"lines": sum(done.strips.values()), "first_line_utc": _utc(stamps, min),
                   "last_line_utc": _utc(stamps, max), "left_out": done.left_out, "missed_rays": done.missed_rays,
-                  "orientation": of.orientation_name, "poses_not_valid": of.orientation.not_valid, "ground": of.ground},
+                  "hidden_cells": done.hidden_cells if args.occlusions else None, "orientation": of.orientation_name,
+                  "poses_not_valid": of.orientation.not_valid, "ground": of.ground},
         )  # fmt: skip
     finally:
         held[0].close()

@@ -15,7 +15,8 @@ from ...solver.geometry.frames import LocalFrame
 from ...solver.orthoimage.error_band import GroundErrors
 from ...solver.orthoimage.ground_grid import GroundGrid, metres_a_unit, utm_of
 from ...solver.orthoimage.orientation import LineOrientation
-from ...solver.orthoimage.surface import Ellipsoid, Surface, UnderAir
+from ...solver.orthoimage.surface import Ellipsoid, HeightField, Surface, UnderAir
+from ...solver.rectification.relief_shadows import ReliefShadows
 from ..batch.rectification import (
     REFINED,
     OfStrips,
@@ -53,6 +54,7 @@ class Prepared:
     estimated, of_camera : how many parameters of the camera were estimated; the file of the camera, if it has one
     target : the local frame with the CRS of the cells
     surface, ground : what rays meet, and its name
+    shadows : what the relief hides, None where nobody asked for it
     errors : what counts for the sigmas besides the orientation, None where nobody asked for them
     pixel_m : size of a pixel on the ground
     notes : remarks on the camera's file
@@ -70,6 +72,7 @@ class Prepared:
     target: LocalFrame
     surface: Surface
     ground: str
+    shadows: ReliefShadows | None
     errors: GroundErrors | None
     pixel_m: float
     notes: tuple[str, ...]
@@ -106,6 +109,7 @@ def prepared(args: argparse.Namespace, path: Path) -> Prepared:
     frame = project_frame(recording)
     target = frame_for(frame, args.crs or _crs(frame))
     surface, ground_m, ground = _ground(args, recording, frame)
+    shadows = ReliefShadows(surface) if args.occlusions and isinstance(surface, HeightField) else None
     if args.refraction is not None:
         surface = UnderAir(surface, frame, refraction_of(args.refraction, WGS84, str(path)))
         ground += ", refraction taken off"
@@ -115,7 +119,7 @@ def prepared(args: argparse.Namespace, path: Path) -> Prepared:
         raise UserError(f"{path}: the camera is {-above:.0f} m below the ground; wanted another --height or --dem")
     return Prepared(
         recording, camera, ccd, name, orientation, reference_ns, of_strip, estimated, of_camera, target, surface,
-        ground, errors, pixel_on_ground(camera, ccd, above), tuple(notes),
+        ground, shadows, errors, pixel_on_ground(camera, ccd, above), tuple(notes),
     )  # fmt: skip
 
 

@@ -82,6 +82,40 @@ class GroundGrid:
             return self.cells(point_l)
         return (_basis((flat - middle) / half) @ coefficients + offset).reshape(*point_l.shape[:-1], 2)
 
+    def on_relief(self, column: Array, row: Array, relief: HeightField) -> Array:
+        """Local points (..., 3) of a relief at places in cells (...); NaN where the relief knows no height.
+
+        The way back of `cells_of_many`, by a polynomial of column, row and Z where that is exact.
+        """
+        lowest, usual, highest = relief.range_m
+        at = np.stack([column.ravel(), row.ravel(), np.full(column.size, usual)], axis=1)
+        low, high = at.min(axis=0), at.max(axis=0)
+        low[2], high[2] = lowest, highest
+        middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1.0)
+        x, y, z = np.meshgrid(*[np.linspace(-1, 1, n) for n in (NODES, NODES, 3)], indexing="ij")
+        nodes = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+        wanted = self._local(middle + half * nodes)
+        design = _basis(nodes)
+        offset = wanted.mean(axis=0)
+        coefficients, *_ = np.linalg.lstsq(design, wanted - offset, rcond=None)
+        exact = np.abs(design @ coefficients - (wanted - offset)).max() < TOLERANCE_CELLS * self.cell_m
+        for _ in range(2):  # the plumb lines of the local frame and of the map differ a little
+            xy = _basis((at - middle) / half) @ coefficients + offset if exact else self._local(at)
+            z = relief.height(xy[:, 0], xy[:, 1])
+            at[:, 2] = np.where(np.isfinite(z), z, usual)
+        return np.column_stack([xy, z]).reshape(*column.shape, 3)
+
+    def _local(self, at: Array) -> Array:
+        """Local X and Y (n, 2) of columns, rows and Z (n, 3)."""
+        x, y = self.centre(at[:, 0], at[:, 1])
+        if self.frame.crs == "local":
+            return np.stack([x, y], axis=1)
+        place = np.stack([x, y, np.zeros(len(at))], axis=1)
+        upright = self.frame.from_crs(place[:1] + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))[:, 2]
+        for _ in range(2):
+            place[:, 2] += (at[:, 2] - self.frame.from_crs(place)[:, 2]) / (upright[1] - upright[0])
+        return self.frame.from_crs(place)[:, :2]
+
 
 def _basis(s: Array) -> Array:
     x, y, z = s.T

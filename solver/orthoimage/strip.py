@@ -14,7 +14,7 @@ gap or overlap.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +88,28 @@ class Rays:
     pixels: int
 
 
+class Shadows(Protocol):
+    """What higher ground hides from rays.
+
+    Attributes
+    ----------
+    knot_m : `room` at places so far apart, metres, tells that of those between
+    """
+
+    knot_m: float
+
+    def room(self, grid: GroundGrid, column: Array, row: Array, slope: Array) -> NDArray[np.float32]:
+        """How much higher the ground might be (...), metres, before it hid places; below zero where they are hidden.
+
+        Parameters
+        ----------
+        grid : of the cells
+        column, row : (...) places on the ground, in cells
+        slope : (..., 2) way of their rays in X and Y a metre of Z; NaN where no ray is known
+        """
+        ...
+
+
 def rays_of(camera: LineCamera, line: int, step: int = NODE_STEP, factor: int = 1) -> Rays:
     """Rays of every ``step``-th pixel of CCD line ``line`` of a camera.
 
@@ -122,10 +144,12 @@ class StripRectifier:
     resampling : of `resampling.TAPS`
     band : lines that are rectified at once
     errors : besides those of the orientation; then patches have sigmas
+    shadows : what higher ground hides is left out; None = it shows what is seen beside it
 
     Attributes
     ----------
     missed : rays that did not meet the ground
+    hidden : cells that were left out because higher ground hides them
 
     Raises
     ------
@@ -134,13 +158,13 @@ class StripRectifier:
 
     def __init__(
         self, rays: Rays, surface: Surface, grid: GroundGrid, resampling: str = "bilinear", band: int = BAND,
-        errors: GroundErrors | None = None,
+        errors: GroundErrors | None = None, shadows: Shadows | None = None,
     ) -> None:  # fmt: skip
         if resampling not in TAPS:
             raise ValueError(f"resampling {resampling!r}, wanted one of {', '.join(TAPS)}")
         self.rays, self.surface, self.grid, self.resampling, self.band = rays, surface, grid, resampling, band
-        self.errors = errors
-        self.missed = 0
+        self.errors, self.shadows = errors, shadows
+        self.missed = self.hidden = 0
         self._axes: _Axes | None = None
         self._first = 0  # number of the first line at hand
         self._pixels = np.empty((0, rays.pixels), dtype=np.uint16)
@@ -148,6 +172,7 @@ class StripRectifier:
         self._cells = np.empty((0, len(rays.sample), 2))
         self._place = np.empty((0, len(rays.sample), 2))
         self._sigma = np.empty((0, len(rays.sample), 2), dtype=np.float32)
+        self._slope = np.empty((0, len(rays.sample), 2), dtype=np.float32)
         self._done = 0  # places p below are rectified
 
     def add(
@@ -182,8 +207,12 @@ class StripRectifier:
         if not len(self._usable):
             self._first = first_line
             self._pixels = self._pixels.astype(pixels.dtype)
-        point, cells = self._to_ground(position_l, R_lc)
+        direction = self.rays.ray_c @ np.swapaxes(R_lc, 1, 2)
+        point, cells = self._to_ground(position_l, direction)
         self._leave_out_far(cells)
+        if self.shadows is not None:
+            slope = np.where(np.isfinite(cells), direction[..., :2] / direction[..., 2:], np.nan)
+            self._slope = np.concatenate([self._slope, slope.astype(np.float32)])
         if self.errors is not None:
             assert covariance is not None
             slope = self.surface.slope(point)
@@ -206,9 +235,8 @@ class StripRectifier:
         self._forget(len(self._usable))
         return out
 
-    def _to_ground(self, position_l: Array, R_lc: Array) -> tuple[Array, Array]:
+    def _to_ground(self, position_l: Array, direction: Array) -> tuple[Array, Array]:
         """Points (n, k, 3) and cells (n, k, 2) that the rays of lines meet."""
-        direction = self.rays.ray_c @ np.swapaxes(R_lc, 1, 2)
         point, met = self.surface.meet(np.asarray(position_l)[:, None, :], direction)
         self.missed += int((~met).sum())
         if not met.any():
@@ -289,7 +317,7 @@ class StripRectifier:
         self._first += lines
         self._pixels, self._usable = self._pixels[lines:], self._usable[lines:]
         self._cells, self._place = self._cells[lines:], self._place[lines:]
-        self._sigma = self._sigma[lines:]
+        self._sigma, self._slope = self._sigma[lines:], self._slope[lines:]
 
     def _band(self, begin: int, end: int) -> Patch | None:
         """Cells with p from ``begin`` to below ``end``."""
@@ -302,6 +330,7 @@ class StripRectifier:
         row, column, length = self._axes.cells_between(begin, end, q0, q1)
         if not len(row):
             return None
+        room = None if self.shadows is None else self._room(self.shadows, begin, end, q0, source)
         # places of the cells, relative to the table
         starts = np.concatenate([[0], np.cumsum(length)])
         p_start, q_start = self._axes.place_of(column, row)
@@ -333,6 +362,14 @@ class StripRectifier:
                 np.rint(grey, out=grey)
                 grey = np.clip(grey, 1, largest, out=grey)  # 0 is for nothing known
                 steep = 255.0 - np.float32(254.0) / middle * np.abs(sample - middle)
+            if room is not None:
+                i, j = (
+                    at * np.float32((knots - 1) / (nodes - 1))
+                    for at, knots, nodes in zip((p, q), room.shape, source.shape, strict=True)
+                )
+                blocked = known & (_bilinear(room, i, j) < 0)
+                self.hidden += int(blocked.sum())
+                known &= ~blocked
             values[part] = np.where(known, grey, 0)
             steepness[part] = np.where(known, steep, 0)
             if sigma is not None:
@@ -340,6 +377,31 @@ class StripRectifier:
                 sigma[part][known] = _bilinear(self._sigma, line[known], node.astype(np.float32))
             run = stop
         return Patch(row, column, length, values, steepness, sigma)
+
+    def _room(
+        self, shadows: Shadows, begin: int, end: int, q0: int, source: NDArray[np.complexfloating]
+    ) -> NDArray[np.float32]:
+        """`Shadows.room` at knots from p = begin to end and q = q0 to the end of the table ``source``."""
+        assert self._axes is not None
+        q1 = q0 + NODE_STEP * (source.shape[1] - 1)
+        knot = max(shadows.knot_m / self.grid.cell_m, 1.0)  # cells
+        per_p, per_q = np.linalg.norm(np.linalg.inv(self._axes.to_place), axis=0).tolist()
+        rows, columns = (int(np.ceil(way / knot)) + 1 for way in ((end - begin) * per_p, (q1 - q0) * per_q))
+        out = np.empty((rows, columns), dtype=np.float32)
+        down, along = np.linspace(0.0, 1.0, rows), np.linspace(0.0, 1.0, columns)
+        some = max(CELLS // columns, 1)
+        for k in range(0, rows, some):
+            i, j = np.meshgrid(down[k : k + some], along, indexing="ij")
+            column, row = self._axes.cell_of(begin + (end - begin) * i, q0 + (q1 - q0) * j)
+            at = ((n - 1) * share.ravel().astype(np.float32) for n, share in zip(source.shape, (i, j), strict=True))
+            place = _bilinear(source, *at)
+            known = np.isfinite(place)
+            line = np.clip(np.real(place[known]), 0, len(self._slope) - 1)
+            node = np.interp(np.imag(place[known]), self.rays.sample, np.arange(len(self.rays.sample)))
+            slope = np.full((i.size, 2), np.nan, dtype=np.float32)
+            slope[known] = _bilinear(self._slope, line, node.astype(np.float32))
+            out[k : k + some] = shadows.room(self.grid, column, row, slope.reshape(*i.shape, 2))
+        return out
 
     def _inverse(self, begin: int, end: int) -> tuple[int, NDArray[np.complexfloating]] | None:
         """Line (of those at hand) and sample, as real and imaginary part, at p = begin .. end and q every so often.
@@ -413,6 +475,12 @@ class _Axes:
     def place_of(self, column: IntArray, row: IntArray) -> tuple[Array, Array]:
         (pc, pr), (qc, qr) = self.to_place
         return pc * column + pr * row + self.shift[0], qc * column + qr * row + self.shift[1]
+
+    def cell_of(self, p: Array, q: Array) -> tuple[Array, Array]:
+        """Column and row (...) of places (...)."""
+        (cp, cq), (rp, rq) = np.linalg.inv(self.to_place)
+        p, q = p - self.shift[0], q - self.shift[1]
+        return cp * p + cq * q, rp * p + rq * q
 
     def cells_between(self, p0: int, p1: int, q0: int, q1: int) -> tuple[IntArray, IntArray, IntArray]:
         """Row, first column and length of the runs of cells with p0 <= p < p1 and q0 <= q < q1."""

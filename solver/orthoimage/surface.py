@@ -184,7 +184,7 @@ class HeightField:
         slope = d[:, :2] / np.where(down, d[:, 2], np.nan)[:, None]
         z = self._correct(origin, slope)
         z[z > origin[:, 2]] = np.nan  # behind the sensor
-        lowest, _, highest = self._heights
+        lowest, _, highest = self.range_m
         begin = np.minimum(highest + 1e-6, origin[:, 2])
         met = np.isfinite(z)
         end = np.where(met, z, lowest - 1e-6)
@@ -199,7 +199,7 @@ class HeightField:
         return point.reshape(shape), np.isfinite(z).reshape(shape[:-1])
 
     @cached_property
-    def _heights(self) -> tuple[float, float, float]:
+    def range_m(self) -> tuple[float, float, float]:
         """Lowest, middle and highest height of the nodes, m."""
         return float(np.nanmin(self.z_m)), float(np.nanmedian(self.z_m)), float(np.nanmax(self.z_m))
 
@@ -247,7 +247,7 @@ class HeightField:
 
     def _correct(self, origin: Array, slope: Array) -> Array:
         """Heights (n,) by relief correction, NaN where it does not converge."""
-        z0 = np.full(len(origin), self._heights[1])
+        z0 = np.full(len(origin), self.range_m[1])
         f0 = self._above(origin, slope, z0)
         z1 = z0 + f0
         for _ in range(ROUNDS):

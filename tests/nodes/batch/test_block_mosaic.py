@@ -473,7 +473,7 @@ def test_virtual_mosaics_have_their_axes_as_gdal_writes_them(crs, tmp_path):
         (["--tile", "0"], "--tile 0: wanted a power of two of at least 128"),
         (["--sensor", "one.geom"], "--sensor: 1 for 3 images"),
         (["--nodata", "255"], "--nodata: goes with an image and its --sensor, and there is none"),
-        (["--occlusions"], "--occlusions: goes with an image and its --sensor, and there is none"),
+        (["--occlusions"], "--occlusions: goes with a recording, or an image and its --sensor, and there is none"),
         (["--orientation", "final"], "--orientation: goes with a recording, and there is none"),
         (["--dem", "heights.tif"], "--dem: goes with a recording, or an image and its --sensor, and there is none"),
         (["--sigma", "s.tif"], "wanted the sigmas of each orthoimage"),

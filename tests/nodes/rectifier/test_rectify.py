@@ -16,6 +16,7 @@ import rasterio
 import rasterio.warp
 from notebook import Notebook
 from rio_cogeo.cogeo import cog_validate
+from scipy import ndimage
 from synthetic_flight import flight_messages
 
 from triline.nodes.batch import rectification as work
@@ -324,6 +325,85 @@ def test_sigmas_beside_the_orthoimage(flown, dem, folder, capsys):
     assert values["truth"] == pytest.approx([np.hypot(np.sqrt(2) * 0.5 * pixel, 0.3), 2.0], rel=0.25)
 
 
+def test_cells_behind_walls_are_left_out(flown, simulated, dem, folder, capsys):
+    """A forward look at walls and blocks: hidden is what rays marched from the ground to the camera find hidden."""
+    raster = read_heights(dem)
+    recording = Recording(flown)
+    _, orientation, reference_ns = work.orientation_of(recording, "truth")
+    camera, strip = recording.camera(), next(iter(recording.last_strips().values()))
+    ccd = camera.line_index["F"]
+    first_s = (strip.first_line_time_ns - reference_ns) * 1e-9
+    ray = np.array([*camera.image_coordinates(np.array([ccd]), np.array([399.5]))[0][0], -camera.focal_length_mm[ccd]])
+
+    # walls along, across and oblique, in the middle of what the line sees
+    C, R = (a[0] for a in orientation.at([first_s + 0.5 * strip.lines / strip.line_rate_hz]))
+    d = R @ ray
+    utm = replace(simulated.simulation.flight.frame, crs=raster.crs)
+    x0, y0, _ = utm.to_crs((C + d * ((30.0 - C[2]) / d[2]))[None])[0]
+    i, j = round((y0 - raster.y0) / raster.dy) - 35, round((x0 - raster.x0) / raster.dx) - 35
+    fine = ndimage.zoom(raster.z_m[i : i + 70, j : j + 70], 2, order=1, grid_mode=True, mode="nearest")  # every 5 m
+    x = raster.x0 + raster.dx * (j - 0.25 + 0.5 * np.arange(fine.shape[1])) - x0
+    y = (raster.y0 + raster.dy * (i - 0.25 + 0.5 * np.arange(fine.shape[0])) - y0)[:, None]
+    for left, bottom, right, top, height in (
+        (-150, -200, -130, 0, 60), (-60, 80, 140, 100, 40), (20, -150, 90, -80, 90), (120, -20, 150, 10, 120),
+    ):  # fmt: skip
+        fine[(x > left) & (x < right) & (y > bottom) & (y < top)] += height
+    oblique = (np.abs(x + y + 220.0) < 12.0) & (np.abs(x - y) < 150.0)
+    fine[oblique] += 50.0
+    walls = folder / "walls.tif"
+    built = Heights(
+        raster.crs, fine, float(x[0] + x0), float(y[0, 0] + y0), 0.5 * raster.dx, 0.5 * raster.dy, above_ellipsoid=True
+    )
+    write_heights(walls, built)
+
+    options = ("--ccd", "F", "--orientation", "truth", "--dem", walls, "--crs", utm.crs, "--gsd", "1.5")
+    _rectify(capsys, flown, folder / "whole.tif", *options)
+    told = _rectify(capsys, flown, folder / "seen.tif", *options, "--occlusions")
+
+    def cells(name):
+        with rasterio.open(folder / name) as image:
+            row, column = image.index(x0, y0)
+            window = rasterio.windows.Window(column - 140, row - 140, 280, 280)
+            return image.read(1, window=window), image.window_transform(window)
+
+    (whole, corner), (seen, _) = cells("whole.tif"), cells("seen.tif")
+    assert (whole > 0).all()
+    left_out = seen == 0
+    assert told["hidden_cells"] >= left_out.sum() > 3000
+    assert (seen == whole)[~left_out].all()
+    at = np.arange(280) + 0.5
+    e, n = np.meshgrid(corner.c + corner.a * at, corner.f + corner.e * at)
+
+    def ground(e, n):
+        return ndimage.map_coordinates(fine, [(n - built.y0) / built.dy, (e - built.x0) / built.dx], order=1, cval=-1e3)
+
+    # some cells of every kind, on their ground
+    rng = np.random.default_rng(7)
+    some = np.unravel_index(rng.choice(seen.size, 1500, replace=False), seen.shape)
+    foot = utm.from_crs(np.column_stack([e[some], n[some], ground(e[some], n[some])]))
+    # the line that looks their way: halving, as what lies ahead of it is passed later
+    early, late = np.zeros(len(foot)), np.full(len(foot), float(strip.lines - 1))
+    for _ in range(20):
+        line = 0.5 * (early + late)
+        C, R = orientation.at(first_s + line / strip.line_rate_hz)
+        image = np.einsum("nij,ni->nj", R, foot - C)
+        ahead = -camera.focal_length_mm[ccd] * image[:, 0] / image[:, 2] > ray[0]
+        early, late = np.where(ahead, line, early), np.where(ahead, late, line)
+    steps = (C - foot) / (C - foot)[:, 2:]
+    hidden = np.zeros(len(foot), dtype=bool)
+    for up in np.arange(0.5, 150.0, 1.0):  # metres of height
+        place = utm.to_crs(foot + up * steps)
+        hidden |= ground(place[:, 0], place[:, 1]) > place[:, 2] + 0.05
+    assert 0.04 < hidden.mean() < 0.5
+    wrong = left_out[some] != hidden
+    edge = ndimage.binary_dilation(left_out, iterations=3) & ~ndimage.binary_erosion(left_out, iterations=3)
+    assert not (wrong & ~edge[some]).any() and wrong.mean() < 0.02
+    # in a mosaic they stay empty, too, where no other strip sees them
+    block = _rectify(capsys, flown, folder / "block.tif", *options, "--occlusions", "--mosaic", "--workers", "1")
+    assert block["layers"][0]["hidden_cells"] == told["hidden_cells"]
+    assert ((cells("block.tif")[0] == 0) == left_out).all()
+
+
 def test_refraction_moves_an_orthoimage_by_as_much_as_the_air_does(flown, folder, capsys):
     plain = _rectify(capsys, flown, folder / "r0.tif", "--gsd", 8, "--crs", "local")
     bent = _rectify(capsys, flown, folder / "r1.tif", "--gsd", 8, "--crs", "local", "--refraction")
@@ -342,6 +422,8 @@ def test_refraction_moves_an_orthoimage_by_as_much_as_the_air_does(flown, folder
         (["--workers", "0"], "--workers: goes with an image and its --sensor, not with a recording"),
         (["--nodata", "0"], "--nodata: goes with an image and its --sensor, not with a recording"),
         (["--correction", "shift"], "--correction: goes with an image and its --sensor, not with a recording"),
+        (["--occlusions"], "--occlusions: goes with --dem, without which no ground is higher than another"),
+        (["--occlusions", "--mosaic", "--height", "300"], "--occlusions: goes with --dem, without which no ground is"),
         (["--tile", "0"], "--tile: goes with --mosaic"),
         (["--feather", "0"], "--feather: goes with --mosaic"),
         (["--ccd", "X"], "no image lines of CCD line 'X', there are: F, N, B"),

@@ -194,6 +194,23 @@ def test_polynomial_to_cells_is_the_projection(crs):
     assert np.nanmax(np.abs(grid.cells_of_many(far) - grid.cells(far))) < 1e-6  # too far for it: the projection itself
 
 
+@pytest.mark.parametrize(
+    ("crs", "gsd"), [("EPSG:25832+5783", 0.25), ("+proj=utm +zone=32 +units=us-ft +type=crs", 1.0), ("local", 0.25)]
+)
+@pytest.mark.parametrize("reach", [1500.0, 60e3])
+def test_relief_under_cells_is_in_these_cells(crs, gsd, reach):
+    """The second one is too far for the polynomial."""
+    grid, field = GroundGrid(replace(FRAME, crs=crs), gsd), _field(step=reach / 50, reach=1.1 * reach)
+    rng = np.random.default_rng(8)
+    column, row = np.moveaxis(grid.cells(np.column_stack([rng.uniform(-reach, reach, (300, 2)), np.zeros(300)])), 1, 0)
+    found = grid.on_relief(column.reshape(20, 15), row.reshape(20, 15), field).reshape(-1, 3)
+    # a polynomial is as good as what its heights are taken at; exact, two rounds leave what plumb lines differ by
+    assert np.abs(grid.cells(found) - np.column_stack([column, row])).max() * grid.cell_m < 0.03
+    np.testing.assert_allclose(found[:, 2], field.height(found[:, 0], found[:, 1]), atol=1e-9)
+    outside = grid.on_relief(column + 3 * reach / gsd, row, field)
+    assert np.isnan(outside[..., 2]).any()
+
+
 def test_heights_of_a_map_projection_in_the_local_frame():
     utm = replace(FRAME, crs=utm_of(FRAME))
     assert utm.crs == "EPSG:32632" and utm_of(LocalFrame(-33.0, 151.0, 0.0)) == "EPSG:32756"
