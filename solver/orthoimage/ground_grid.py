@@ -99,6 +99,7 @@ class GroundGrid:
         offset = wanted.mean(axis=0)
         coefficients, *_ = np.linalg.lstsq(design, wanted - offset, rcond=None)
         exact = np.abs(design @ coefficients - (wanted - offset)).max() < TOLERANCE_CELLS * self.cell_m
+        xy, z = at[:, :2], at[:, 2]
         for _ in range(2):  # the plumb lines of the local frame and of the map differ a little
             xy = _basis((at - middle) / half) @ coefficients + offset if exact else self._local(at)
             z = relief.height(xy[:, 0], xy[:, 1])

@@ -89,14 +89,12 @@ class Rays:
 
 
 class Shadows(Protocol):
-    """What higher ground hides from rays.
+    """What higher ground hides from rays."""
 
-    Attributes
-    ----------
-    knot_m : `room` at places so far apart, metres, tells that of those between
-    """
-
-    knot_m: float
+    @property
+    def knot_m(self) -> float:
+        """How far places may be apart whose `room` tells that of those between, metres."""
+        ...
 
     def room(self, grid: GroundGrid, column: Array, row: Array, slope: Array) -> NDArray[np.float32]:
         """How much higher the ground might be (...), metres, before it hid places; below zero where they are hidden.

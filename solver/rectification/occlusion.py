@@ -109,7 +109,7 @@ def _tops(values: NDArray[np.float32], row: Array, column: Array, h: Array, spee
         np.clip(np.nan_to_num(a) // side, 0, n - 1).astype(np.intp)
         for a, n in zip((row, column), tops.shape, strict=True)
     )
-    return tops[tuple(at)]
+    return np.asarray(tops[tuple(at)], dtype=np.float32)
 
 
 def place_slopes(terrain: Terrain, lat: Array, lon: Array, height_m: Array, ellipsoid: Ellipsoid) -> Array:
