@@ -153,6 +153,24 @@ class Step:
     left: list[LeftPoints] = field(default_factory=list)
 
 
+def before(left: Marginal, later: BlockSolution) -> BlockSolution:
+    """The solution for unknowns that left at one time and those that stayed then, from one for the latter.
+
+    The cofactors of those that stayed are made symmetric: what rounding leaves of asymmetry would come back with
+    the wrong sign in half of the cofactors between both, and grow from step to step without bounds.
+    """
+    x2, Q22 = later.of(left.stayed)
+    Q22 = 0.5 * (Q22 + Q22.T)
+    x1 = solve_triangular(left.R11, left.d1 - left.R12 @ x2, check_finite=False)
+    T = solve_triangular(left.R11, left.R12, check_finite=False)
+    own = solve_triangular(left.R11, np.eye(len(x1)), check_finite=False)
+    Q12 = -T @ Q22
+    Q = np.block([[own @ own.T - Q12 @ T.T, Q12], [Q12.T, Q22]])
+    numbers, values = np.concatenate([left.gone, left.stayed]), np.concatenate([x1, x2])
+    order = np.argsort(numbers)
+    return BlockSolution(numbers[order], values[order], Q[np.ix_(order, order)])
+
+
 def backward(steps: list[Step], state: WindowState) -> WholeStrips:
     """Go back through the steps, one or more, from the present state of the window."""
     found = WholeStrips([], [])
@@ -160,16 +178,7 @@ def backward(steps: list[Step], state: WindowState) -> WholeStrips:
     cofactors = state.covariance(stayed) if len(stayed) else np.empty((0, 0))
     solution = BlockSolution(stayed, state.values(stayed), cofactors)
     for step in reversed(steps):
-        m = step.marginal
-        x2, Q22 = solution.of(m.stayed)
-        x1 = solve_triangular(m.R11, m.d1 - m.R12 @ x2, check_finite=False)
-        T = solve_triangular(m.R11, m.R12, check_finite=False)
-        own = solve_triangular(m.R11, np.eye(len(x1)), check_finite=False)
-        Q12 = -T @ Q22
-        Q = np.block([[own @ own.T - Q12 @ T.T, Q12], [Q12.T, Q22]])
-        numbers, values = np.concatenate([m.gone, m.stayed]), np.concatenate([x1, x2])
-        order = np.argsort(numbers)
-        solution = BlockSolution(numbers[order], values[order], Q[np.ix_(order, order)])
+        solution = before(step.marginal, solution)
         if step.orientation is not None:
             found.orientation.append(step.orientation.refined(solution))
         for left in reversed(step.left):
