@@ -140,10 +140,20 @@ class PairPrediction(Prediction):
         three_sigma, most = self._three_sigma_px(), self.options.largest_reach_px
         reach = max(three_sigma, most)
         sees = (u > first - reach) & (u < last + reach)
-        if three_sigma <= most:  # else the view may lie beside where it is expected
+        if three_sigma <= most:
             sees &= (v > 0) & (v < there.view.pixels - 1)
+        else:  # the view may lie beside where it is expected; with places that it cannot see too few are found
+            sees &= self._beside_px(there, point, u, v) < three_sigma
         located[near[sees]] = np.column_stack([u, v])[sees]
         return located
+
+    def _beside_px(self, there: LineScan, point_l: Array, line: Array, sample: Array) -> Array:
+        """How far (n,) points (n, 3) lie beside the ends of the line, px; 0 between them. Samples are those of the
+        nearest end there."""
+        end, _ = there.to_plane(line, sample, point_l[:, 2])
+        across = np.array([-there.way[1], there.way[0]])
+        beside = np.abs((point_l - end)[:, :2] @ across) / self._pixel_m
+        return np.where((sample > 0) & (sample < there.view.pixels - 1), 0.0, beside)
 
     def _near(self, here: LineScan, there: LineScan, line: Array, sample: Array) -> NDArray[np.bool_]:
         """Which places may lie in the lines of the other view; the others are far from them."""

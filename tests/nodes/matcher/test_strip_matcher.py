@@ -32,6 +32,9 @@ from triline.solver.camera.line_camera import LineCamera
 from triline.solver.camera.sensors import preset
 from triline.solver.geometry.rotation import angles_from_matrix
 from triline.solver.matching.line_times import LineTimes
+from triline.solver.matching.options import MatchingOptions, Place
+from triline.solver.matching.pair_prediction import PairPrediction
+from triline.solver.matching.round_earth import RoundHeights
 from triline.solver.matching.strip_matcher import StripMatcher
 from triline.solver.models.dgr import DgrOptions
 
@@ -327,7 +330,7 @@ def test_lines_that_a_budget_does_not_hold():
     assert [text for text in told if "hold the last" in text and "of 300 lines" in text]
 
 
-def of_one_line(pose, first_line=0):
+def of_one_line(pose, first_line=0, sigma_m=1e-3):
     """A matcher of a camera with one CCD line, 1 km up, and its only strip, of 300 lines and 12 s."""
     camera = preset("spot5-hrs")
     line = camera.lines[0]
@@ -335,7 +338,8 @@ def of_one_line(pose, first_line=0):
     matcher = StripMatcher(LineCamera("one", lens, (line,)))
     matcher.begin_strip("S1", LineTimes(-first_line / 25.0, 25.0), first_line)
     for t in np.arange(0.0, 12.0, 0.05):
-        matcher.add_pose(t, pose(t), np.array([0.0, 0, 0, 1]), np.diag(np.full(6, 1e-6)))
+        covariance = np.diag([sigma_m**2] * 3 + [1e-12] * 3)
+        matcher.add_pose(t, pose(t), np.array([0.0, 0, 0, 1]), covariance)
     matcher.add_lines(line.id, first_line, np.full((300, 12000), 700, np.uint16))
     return matcher, matcher._strips["S1"].views[line.id]
 
@@ -374,6 +378,22 @@ def test_the_first_lines_of_a_long_strip_keep_their_orientation():
     assert orientation.start_s == 0.0 and orientation.end_s > 299.0
     position, _ = orientation.at([0.5, 10.0, 299.0])
     assert position[:, 0] == pytest.approx([30.0, 600.0, 17940.0], abs=1e-3)
+
+
+def test_places_are_looked_for_no_farther_beside_a_strip_than_the_orientation_may_be_wrong():
+    """A pixel of 11 mm, and positions to 0.3 m: all of the swath was looked for in 12 % of it, and never was a third of
+    that found, so that no such strips were tied."""
+    _, left = of_one_line(lambda t: np.array([60.0 * t, 0.0, 1000.0]), sigma_m=0.3)
+    _, right = of_one_line(lambda t: np.array([60.0 * t, -118.0, 1000.0]), sigma_m=0.3)
+    for way in (1.0, -1.0):  # both strips forth, and the first one from the other side
+        here, there = (left, right) if way > 0 else (right, left)
+        prediction = PairPrediction((here, there), 1, MatchingOptions(), RoundHeights(0.0, 60.0))
+        prediction.renew()
+        sample = np.arange(50.0, 12000.0, 100.0)
+        seen = np.isfinite(prediction.seen([Place(150.0, s) for s in sample.tolist()])[:, 0])
+        three_sigma = 3 * np.sqrt(2.0) * 0.3 / 0.0112
+        assert 80 < three_sigma < 120
+        assert 1430 < np.ptp(sample[seen]) < 1430 + 2.5 * three_sigma  # 118 of 134 m are beside
 
 
 def test_bad_input():
