@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -35,8 +36,11 @@ class Job:
     arguments: tuple[Any, ...]
 
 
-def _hold_little() -> None:
+def _begin_worker() -> None:
     os.environ["GDAL_CACHEMAX"] = str(CACHE_MB)
+    # Ctrl-C is sent to workers, too: they end without a word, the first process says it
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
 
 
 class Workers:
@@ -100,9 +104,13 @@ class Workers:
         if self._pool is None:
             # fresh processes: GDAL and BLAS have threads, which a forked one would lack
             self._pool = ProcessPoolExecutor(
-                self.number, mp_context=multiprocessing.get_context("spawn"), initializer=_hold_little
+                self.number, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker
             )
-        running = [self._pool.submit(work, *job.arguments) for job in jobs]
+        held = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # until a worker has begun
+        try:
+            running = [self._pool.submit(work, *job.arguments) for job in jobs]
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, held)
         try:
             for k, future in enumerate(as_completed(running)):
                 future.result()
