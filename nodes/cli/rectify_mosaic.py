@@ -6,6 +6,7 @@ import argparse
 import copy
 import os
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -51,7 +52,7 @@ from .heights_under import rasters_of_heights
 from .named_files import named_files
 from .outputs import refuse_over_files
 from .progress import progress
-from .rectify_recording import Prepared, cells_of, check_strips, pixels_together, prepared
+from .rectify_recording import TRUTH_ALONE, Prepared, cells_of, check_strips, pixels_together, prepared
 
 #: Cells a side of a tile: least, and when nobody asks for another.
 LEAST_TILE, TILE = 128, 1024
@@ -132,6 +133,8 @@ def run(args: argparse.Namespace) -> int:
     result = _result(args, outputs, settings, layers, folder, done)
     result["notes"] = _notes(kinds, crs)
     result["notes"] += [f"{layer.name}: {note}" for layer in layers for note in layer.told.get("notes", ())]
+    if args.orientation is None and any(layer.told.get("orientation") == "truth" for layer in layers):
+        result["notes"].append(TRUTH_ALONE)
     result["continued"] = before + counts["done before"] if continued else 0
     if args.stac is not None:
         write_stac_item(args.stac, outputs.mosaic, crs, gsd, done, result, _assets(outputs))
@@ -534,6 +537,9 @@ def _tell(result: dict[str, Any], args: argparse.Namespace) -> None:
             f"{step['balanced_tone_rms']:.2f} after the balance (RMS of the lines; of single nodes "
             f"{step['raw_rms']:.2f} and {step['balanced_rms']:.2f})"
         )
+    by = Counter(layer["orientation"] for layer in result["layers"] if "orientation" in layer)
+    if by:
+        print("  orientation of the strips: " + ", ".join(f"{name} ({n})" for name, n in by.items()))
     for layer in result["layers"]:
         for why, lines in layer.get("left_out", {}).items():
             print(f"  left out of {layer['name']}: {lines} lines {why}")

@@ -40,6 +40,11 @@ from .locate import refraction_of
 
 #: An orthoimage with more cells than this is refused: the mosaic is put together in memory.
 MOST_CELLS = 4e9
+#: Note where nobody asked for the truth.
+TRUTH_ALONE = (
+    "the recording has no orientation but the truth of its simulation, which is taken, with sigmas of 0; "
+    "'triline process' makes one of its sensor data"
+)
 
 
 @dataclass(frozen=True)
@@ -101,6 +106,8 @@ def prepared(args: argparse.Namespace, path: Path) -> Prepared:
     else:
         name, orientation, reference_ns = orientation_of(recording, args.orientation)
         of_strip = OfStrips(recording, name, orientation, reference_ns)
+        if name == "truth" and args.orientation is None and not args.mosaic:
+            notes.append(TRUTH_ALONE)
     estimated = 0
     if args.camera is not None:
         camera, of_camera = read_camera_instead(args.camera, camera, notes=notes), args.camera

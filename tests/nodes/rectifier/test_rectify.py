@@ -487,6 +487,18 @@ def test_recordings_that_cannot_be_rectified(flown, folder, capsys):
     )
 
 
+@pytest.mark.parametrize("mosaic", [[], ["--mosaic", "--workers", "1"]])
+def test_the_truth_is_told_where_nobody_asked_for_it(flown, folder, capsys, mosaic):
+    """Of a recording that went through no node: its mosaic, with sigmas of 0, did not say which orientation it has."""
+    words = ["rectify", str(folder / "raw.mcap"), "-o", str(folder / "true.tif"), "--gsd", "20", "--height", "0"]
+    for asked, told in (([], True), (["--orientation", "truth"], False)):
+        capsys.readouterr()
+        assert main([*words, *mosaic, *asked]) == 0
+        out = capsys.readouterr().out
+        assert ("note: the recording has no orientation but the truth" in out) == told
+        assert ("orientation of the strips: truth (1)" if mosaic else "truth orientation") in out
+
+
 def test_lost_blocks_leave_a_hole_and_are_told(flown, folder, capsys):
     gone = 0
     with RecordingWriter(folder / "holes.mcap") as writer:
