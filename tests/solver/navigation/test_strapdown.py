@@ -59,7 +59,8 @@ def local_level(true, start_s, end_s):
         return np.array([v[0] / (R_N + h), v[1] / ((R_E + h) * np.cos(lat)), -v[2], *dv, *dq])
 
     y0 = np.array([lat, lon, h, *s.velocity_n[0], *quaternion_from_matrix(s.R_nb[0])])
-    y = solve_ivp(rates, (start_s, end_s), y0, method="DOP853", rtol=1e-11, atol=1e-11).y[:, -1]
+    # with 1e-11 its own error in velocity is up to 4e-7 m/s, by the processor; that of `propagate` is 8e-8
+    y = solve_ivp(rates, (start_s, end_s), y0, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
     R_en = earth.R_en(y[0], y[1])
     q = y[6:] / np.linalg.norm(y[6:])
     return earth.ecef_from_geodetic(*y[:3]), R_en @ y[3:6], R_en @ matrix_from_quaternion(q)
