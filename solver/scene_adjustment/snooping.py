@@ -3,8 +3,9 @@
 Of an object point at most one image point goes in a round, and none that fails by much less than the worst of all. What
 was left out and agrees with the rest returns once. A control coordinate goes only where it fails clearly while the
 image points fit; where all image points of a point went, three or more, and agree with each other, its given
-coordinates go in their place: grossly wrong ones bend the block so much that these fail first. Where too many image
-points would go, model or sigmas are wrong, and nothing is left out.
+coordinates go in their place: grossly wrong ones bend the block so much that these fail first. It is the same with a
+tie point that lost so many that it has no place any more. Where too many image points would go, model or sigmas are
+wrong, and nothing is left out.
 """
 
 from __future__ import annotations
@@ -170,7 +171,8 @@ def _exchange(
 ) -> SceneSolution:
     """Put back into the masks all image points of a point that went, in place of its given coordinates.
 
-    Each point once, and only where its image points, three or more, agree with each other.
+    Each point once, and only where its image points, three or more, agree with each other; so do the image points, two
+    or more, of a point without given coordinates that has no place any more.
 
     Returns
     -------
@@ -180,6 +182,7 @@ def _exchange(
     n = len(given)
     rays, kept = np.bincount(point, minlength=n), np.bincount(point, use, n)
     deserted = given.any(axis=1) & (rays >= 3) & (kept == 0)
+    deserted |= ~given.any(axis=1) & (rays >= 2) & (kept < rays) & ~solution.determined
     deserted[list(exchanged)] = False
     points = np.flatnonzero(deserted)
     if not len(points):
