@@ -61,7 +61,7 @@ KINDS = {
     "headwall": "Headwall poses (imu_gps.txt)",
     "resonon": "Resonon poses (.lcf)",
     "gpx": "GPX track",
-    "rtklib": "RTKLIB positions (.pos)",
+    "rtklib": "RTKLIB file of positions (.pos)",
     "ros2": "ROS 2 bag (folder with metadata.yaml, MCAP file or .db3 file) with NavSatFix, Imu and Image",
     "lines": "image lines: ENVI image with .hdr, TIFF, or with --raw plain values",
     "ties": "AVIRIS-NG tie points (GeoCal XML)",

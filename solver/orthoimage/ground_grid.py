@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -70,17 +71,10 @@ class GroundGrid:
         if self.frame.crs == "local":
             return self.cells(point_l)
         flat = point_l.reshape(-1, 3)
-        low, high = np.nanmin(flat, axis=0), np.nanmax(flat, axis=0)
-        middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1.0)
-        x, y, z = np.meshgrid(*[np.linspace(-1, 1, n) for n in (NODES, NODES, 3)], indexing="ij")
-        nodes = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
-        wanted = self.cells(middle + half * nodes)
-        design = _basis(nodes)
-        offset = wanted.mean(axis=0)
-        coefficients, *_ = np.linalg.lstsq(design, wanted - offset, rcond=None)
-        if not np.abs(design @ coefficients - (wanted - offset)).max() < TOLERANCE_CELLS:
+        polynomial, off = _polynomial(self.cells, np.nanmin(flat, axis=0), np.nanmax(flat, axis=0))
+        if not off < TOLERANCE_CELLS:
             return self.cells(point_l)
-        return (_basis((flat - middle) / half) @ coefficients + offset).reshape(*point_l.shape[:-1], 2)
+        return polynomial(flat).reshape(*point_l.shape[:-1], 2)
 
     def on_relief(self, column: Array, row: Array, relief: HeightField) -> Array:
         """Local points (..., 3) of a relief at places in cells (...); NaN where the relief knows no height.
@@ -91,17 +85,11 @@ class GroundGrid:
         at = np.stack([column.ravel(), row.ravel(), np.full(column.size, usual)], axis=1)
         low, high = at.min(axis=0), at.max(axis=0)
         low[2], high[2] = lowest, highest
-        middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1.0)
-        x, y, z = np.meshgrid(*[np.linspace(-1, 1, n) for n in (NODES, NODES, 3)], indexing="ij")
-        nodes = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
-        wanted = self._local(middle + half * nodes)
-        design = _basis(nodes)
-        offset = wanted.mean(axis=0)
-        coefficients, *_ = np.linalg.lstsq(design, wanted - offset, rcond=None)
-        exact = np.abs(design @ coefficients - (wanted - offset)).max() < TOLERANCE_CELLS * self.cell_m
+        polynomial, off = _polynomial(self._local, low, high)
+        to_local = polynomial if off < TOLERANCE_CELLS * self.cell_m else self._local
         xy, z = at[:, :2], at[:, 2]
         for _ in range(2):  # the plumb lines of the local frame and of the map differ a little
-            xy = _basis((at - middle) / half) @ coefficients + offset if exact else self._local(at)
+            xy = to_local(at)
             z = relief.height(xy[:, 0], xy[:, 1])
             at[:, 2] = np.where(np.isfinite(z), z, usual)
         return np.column_stack([xy, z]).reshape(*column.shape, 3)
@@ -116,6 +104,18 @@ class GroundGrid:
         for _ in range(2):
             place[:, 2] += (at[:, 2] - self.frame.from_crs(place)[:, 2]) / (upright[1] - upright[0])
         return self.frame.from_crs(place)[:, :2]
+
+
+def _polynomial(exactly: Callable[[Array], Array], low: Array, high: Array) -> tuple[Callable[[Array], Array], float]:
+    """A polynomial for a function of places (n, 3) between two corners (3,), and how far it is off at most."""
+    middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1.0)
+    x, y, z = np.meshgrid(*[np.linspace(-1, 1, n) for n in (NODES, NODES, 3)], indexing="ij")
+    nodes = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+    wanted, design = exactly(middle + half * nodes), _basis(nodes)
+    offset = wanted.mean(axis=0)
+    coefficients, *_ = np.linalg.lstsq(design, wanted - offset, rcond=None)
+    off = float(np.abs(design @ coefficients - (wanted - offset)).max())
+    return lambda at: _basis((at - middle) / half) @ coefficients + offset, off
 
 
 def _basis(s: Array) -> Array:
