@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
-import signal
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +13,7 @@ from typing import Any
 
 from ..errors import UserError
 from ..formats.new_file import new_file
+from ..worker_pool import WorkerPool
 
 #: A job whose process was lost is begun again so many times.
 RETRIES = 3
@@ -38,9 +37,6 @@ class Job:
 
 def _begin_worker() -> None:
     os.environ["GDAL_CACHEMAX"] = str(CACHE_MB)
-    # Ctrl-C is sent to workers, too: they end without a word, the first process says it
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
 
 
 class Workers:
@@ -53,7 +49,7 @@ class Workers:
 
     def __init__(self, number: int) -> None:
         self.number = number
-        self._pool: ProcessPoolExecutor | None = None
+        self._pool: WorkerPool | None = None
 
     def __enter__(self) -> Workers:
         return self
@@ -102,15 +98,8 @@ class Workers:
         self, work: Callable[..., None], jobs: list[Job], total: int, told: Callable[[float], None] | None
     ) -> None:
         if self._pool is None:
-            # fresh processes: GDAL and BLAS have threads, which a forked one would lack
-            self._pool = ProcessPoolExecutor(
-                self.number, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_worker
-            )
-        held = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # until a worker has begun
-        try:
-            running = [self._pool.submit(work, *job.arguments) for job in jobs]
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, held)
+            self._pool = WorkerPool(self.number, _begin_worker, fresh=True)
+        running = [self._pool.submit(work, *job.arguments) for job in jobs]
         try:
             for k, future in enumerate(as_completed(running)):
                 future.result()

@@ -7,15 +7,15 @@ import pickle
 import resource
 import secrets
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
 from ...solver.partitioned.runner import Runner, Store
 from ..dask_cluster import connect
 from ..errors import UserError
+from ..worker_pool import WorkerPool
 
 T = TypeVar("T")
 
@@ -90,10 +90,7 @@ class ProcessRunner(_Counted):
     def __init__(self, store: FolderStore, workers: int):
         super().__init__(store)
         self.workers = workers
-        self._pool = self._new_pool()
-
-    def _new_pool(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(self.workers, mp_context=get_context("spawn"))
+        self._pool = WorkerPool(workers, fresh=True)
 
     def results(
         self, task: Callable[..., Any], keys: Sequence[int], arguments: Callable[[int], tuple[Any, ...]]
@@ -126,7 +123,7 @@ class ProcessRunner(_Counted):
                         raise UserError(f"partition {keys[place]}: the process that works on it ended {RETRIES} times")
                 todo += sorted(again, reverse=True)
                 self._pool.shutdown(wait=False, cancel_futures=True)
-                self._pool = self._new_pool()
+                self._pool = WorkerPool(self.workers, fresh=True)
 
     def close(self) -> None:
         """End the processes."""

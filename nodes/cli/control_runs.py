@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -32,6 +32,7 @@ from ..batch.scene_adjustment import (
 from ..batch.two_steps import sigmas_stated
 from ..errors import UserError
 from ..formats.scene_block import SceneBlockData
+from ..worker_pool import WorkerPool
 from .adjust import adjust_block, models_of, wanders
 
 Array = NDArray[np.floating]
@@ -473,7 +474,7 @@ def run_all(work: Work, jobs: int, tell: Tell = None) -> list[Run]:
 
     if jobs > 1:
         try:
-            with ProcessPoolExecutor(jobs, initializer=_begin, initargs=(work,)) as pool:
+            with WorkerPool(jobs, _begin, (work,)) as pool:
                 futures = {pool.submit(_one, k): k for k in range(total)}
                 for future in as_completed(futures):
                     keep(futures[future], future.result())

@@ -7,7 +7,6 @@ import csv
 import hashlib
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -29,6 +28,7 @@ from ..formats.new_file import new_file, refuse_unless_file
 from ..simulator.flight_settings import GROUND_M
 from ..simulator.motion_track import motion_of
 from ..simulator.world_settings import world_text
+from ..worker_pool import WorkerPool
 from .misspecified_flights import Flown, KeptFlights, code_digest
 from .misspecified_nodes import through_nodes
 from .progress import progress
@@ -127,8 +127,8 @@ def _flights(
     return flights
 
 
-def _pool(jobs: int) -> ProcessPoolExecutor | nullcontext[None]:
-    return ProcessPoolExecutor(jobs) if jobs > 1 else nullcontext()
+def _pool(jobs: int) -> WorkerPool | nullcontext[None]:
+    return WorkerPool(jobs) if jobs > 1 else nullcontext()
 
 
 def _plan(args: argparse.Namespace) -> str:

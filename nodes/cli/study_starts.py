@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +34,7 @@ from ..report.flight import collect
 from ..report.source import messages_of
 from ..simulator.flight_settings import simulated_flight
 from ..simulator.simulator import Simulator
+from ..worker_pool import WorkerPool
 from .matched_ties import EPOCH_NS, ROUGH
 from .progress import progress
 
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         for i in range(args.seeds)
     ]
     rows = []
-    with progress("flights", args.quiet or args.json) as tell, ProcessPoolExecutor(args.jobs) as pool:
+    with progress("flights", args.quiet or args.json) as tell, WorkerPool(args.jobs) as pool:
         for row in (pool.map if args.jobs > 1 else map)(fly, cases):
             rows.append(row)
             if tell is not None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,6 +36,7 @@ from ..report.flight import collect
 from ..report.source import messages_of
 from ..simulator.flight_settings import simulated_flight
 from ..simulator.simulator import Simulator
+from ..worker_pool import WorkerPool
 from .matched_ties import EPOCH_NS, ROUGH, is_matched, is_target, simulated_ties, tie_errors
 from .progress import progress
 
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
         {**base, **KINDS[kind], "seed": args.first + i, "kind": kind} for kind in args.kinds for i in range(args.seeds)
     ]
     rows = []
-    with progress("flights", args.quiet or args.json) as tell, ProcessPoolExecutor(args.jobs) as pool:
+    with progress("flights", args.quiet or args.json) as tell, WorkerPool(args.jobs) as pool:
         for row in (pool.map if args.jobs > 1 else map)(partial(fly, again=args.again), cases):
             rows.append(row)
             if tell is not None:
