@@ -20,7 +20,7 @@ from ...solver.orthoimage.ground_grid import GroundGrid, utm_of
 from ...solver.orthoimage.heights_of_points import heights_of_points
 from ...solver.orthoimage.mosaic import Mosaic
 from ...solver.orthoimage.orientation import SAME_S, LineOrientation
-from ...solver.orthoimage.strip import Shadows, StripRectifier, rays_of
+from ...solver.orthoimage.strip import Shadows, StripRectifier, rays_of, step_over
 from ...solver.orthoimage.surface import HeightField, Surface
 from ...solver.simulation.flight import Flight
 from .. import convert
@@ -437,7 +437,7 @@ class Rectification:
                 f"--gsd {grid.gsd:g}: leaves less than two cells for the {line.pixels} pixels of CCD line {line.id!r}, "
                 f"wanted {most:.3g} at most"
             )
-        self.rays = rays_of(camera, ccd, factor=factor)
+        self.rays = rays_of(camera, ccd, step_over(surface, grid), factor)
         self.surface, self.grid, self.resampling = surface, grid, resampling
         self.orientation, self.reference_ns, self.factor, self.errors = orientation, reference_ns, factor, errors
         self.result: Rectified | None = None

@@ -29,8 +29,11 @@ Array = NDArray[np.floating]
 IntArray = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-#: Pixels from one ray to the next, and rays beyond either end of the CCD line.
-NODE_STEP, BEYOND = 16, 2
+#: Pixels from one ray to the next where the ground is smooth, and at least, and rays beyond either end of the CCD line.
+NODE_STEP, LEAST_STEP, BEYOND = 16, 2, 2
+#: The ground between two rays may be off the straight line by so many cells in height: of a line that looks 27 degrees
+#: aside or ahead, half a cell in the plane.
+OFF_CELLS = 1.0
 #: Rows of the inverse table a line: where a jolt slows the scan down, line as a function of place bends sharply.
 ROWS = 3
 #: The first and last lines go on straight for so many, so that the orthoimage ends where the lines do.
@@ -81,11 +84,13 @@ class Rays:
     sample : (k,) px, ascending
     ray_c : (k, 3) directions, image frame
     pixels : of the CCD line
+    step : from one ray to the next, px, as far as the CCD line goes
     """
 
     sample: Array
     ray_c: Array
     pixels: int
+    step: int
 
 
 class Shadows(Protocol):
@@ -128,7 +133,15 @@ def rays_of(camera: LineCamera, line: int, step: int = NODE_STEP, factor: int = 
     sample = np.concatenate([-outer[::-1], inner, pixels - 1 + outer])
     full = factor * sample + 0.5 * (factor - 1)
     xy = camera.image_coordinates(np.full(len(full), line), full)[0]
-    return Rays(sample, np.column_stack([xy, np.full(len(xy), -camera.focal_length_mm[line])]), pixels)
+    return Rays(sample, np.column_stack([xy, np.full(len(xy), -camera.focal_length_mm[line])]), pixels, step)
+
+
+def step_over(surface: Surface, grid: GroundGrid) -> int:
+    """Pixels from one ray to the next, for a ground in cells about as large as the pixels: fewer where it has walls."""
+    step = NODE_STEP
+    while step > LEAST_STEP and surface.bend_m(step * grid.cell_m) > OFF_CELLS * grid.cell_m:
+        step //= 2
+    return step
 
 
 class StripRectifier:
@@ -324,7 +337,7 @@ class StripRectifier:
         if table is None:
             return None
         q0, source = table
-        q1 = q0 + NODE_STEP * (source.shape[1] - 1)
+        q1 = q0 + self.rays.step * (source.shape[1] - 1)
         row, column, length = self._axes.cells_between(begin, end, q0, q1)
         if not len(row):
             return None
@@ -334,10 +347,10 @@ class StripRectifier:
         p_start, q_start = self._axes.place_of(column, row)
         p_start, q_start = (
             (ROWS * (p_start - begin)).astype(np.float32),
-            ((q_start - q0) / NODE_STEP).astype(np.float32),
+            ((q_start - q0) / self.rays.step).astype(np.float32),
         )
         dp = np.float32(ROWS * self._axes.to_place[0, 0])
-        dq = np.float32(self._axes.to_place[1, 0] / NODE_STEP)
+        dq = np.float32(self._axes.to_place[1, 0] / self.rays.step)
         dtype = self._pixels.dtype
         values = np.zeros(starts[-1], dtype=dtype)
         steepness = np.zeros(starts[-1], dtype=np.uint8)
@@ -381,7 +394,7 @@ class StripRectifier:
     ) -> NDArray[np.float32]:
         """`Shadows.room` at knots from p = begin to end and q = q0 to the end of the table ``source``."""
         assert self._axes is not None
-        q1 = q0 + NODE_STEP * (source.shape[1] - 1)
+        q1 = q0 + self.rays.step * (source.shape[1] - 1)
         knot = max(shadows.knot_m / self.grid.cell_m, 1.0)  # cells
         per_p, per_q = np.linalg.norm(np.linalg.inv(self._axes.to_place), axis=0).tolist()
         rows, columns = (int(np.ceil(way / knot)) + 1 for way in ((end - begin) * per_p, (q1 - q0) * per_q))
@@ -426,8 +439,8 @@ class StripRectifier:
         if not np.isfinite(q).any():
             return None
         q0 = int(np.floor(np.nanmin(q)))
-        count = int(np.ceil((np.nanmax(q) - q0) / NODE_STEP)) + 1
-        q_wanted = q0 + NODE_STEP * np.arange(count, dtype=float)
+        count = int(np.ceil((np.nanmax(q) - q0) / self.rays.step)) + 1
+        q_wanted = q0 + self.rays.step * np.arange(count, dtype=float)
         table = np.full((len(p_wanted), count), np.nan + 0j, dtype=np.complex64)
         sample = self.rays.sample
         for i in range(len(p_wanted)):

@@ -23,6 +23,9 @@ TOLERANCE_M, ROUNDS = 1e-3, 12
 STEPS_A_CELL, MOST_STEPS = 2.0, 4096
 #: Cells a side of the squares whose highest and steepest ground tells which rays are searched. Tuned.
 SQUARE_CELLS = 8
+#: Share of the heights that may be further off a straight line than `Surface.bend_m` says, and so many heights of a
+#: large grid tell it. Tuned: a few walls are enough.
+BENT, BENDS = 0.002, 1_000_000
 #: Rounds of a bent ray with the ground. Derived: the shift changes by 1e-4 of a change in height, which is itself the
 #: shift times the slope of the ground, so the second round leaves less than a millimetre.
 _AIR_ROUNDS = 2
@@ -49,6 +52,10 @@ class Surface(Protocol):
         """dZ/dX and dZ/dY (..., 2) at points (..., 3) on it; NaN where it is not known."""
         ...
 
+    def bend_m(self, length_m: float) -> float:
+        """How far its heights are off the straight lines between places so far apart, m: `BENT` of them by more."""
+        ...
+
 
 @dataclass(frozen=True)
 class Plane:
@@ -71,6 +78,10 @@ class Plane:
     def slope(self, point_l: Array) -> Array:
         """See `Surface.slope`."""
         return np.zeros((*point_l.shape[:-1], 2))
+
+    def bend_m(self, length_m: float) -> float:
+        """See `Surface.bend_m`."""
+        return 0.0
 
 
 @dataclass(frozen=True)
@@ -111,6 +122,10 @@ class Ellipsoid:
         point_e = point_l @ self.frame.R_el.T + self.frame.origin_e
         normal = (point_e / np.array([a * a, a * a, b * b])) @ self.frame.R_el
         return -normal[..., :2] / normal[..., 2:]
+
+    def bend_m(self, length_m: float) -> float:
+        """See `Surface.bend_m`; that of the Earth is left out."""
+        return 0.0
 
 
 @dataclass(frozen=True)
@@ -169,6 +184,19 @@ class HeightField:
             one = np.where(np.isfinite(after), after - here, here - before) / half
             out.append(np.where(np.isfinite(both), both, one))
         return np.stack(out, axis=-1)
+
+    def bend_m(self, length_m: float) -> float:
+        """See `Surface.bend_m`; in the middle between two nodes, of some rows and columns of a large grid."""
+        apart = max(round(0.5 * length_m / self.step_m), 1)
+        found = []
+        for z in (self.z_m, self.z_m.T):
+            z = z[:: max(z.size // BENDS, 1)]
+            off = z[:, apart:-apart] - 0.5 * (z[:, : -2 * apart] + z[:, 2 * apart :])
+            found.append(np.abs(off[np.isfinite(off)]))
+        off = np.concatenate(found)
+        # between nodes the ground is straight: a shorter line meets fewer of the bends, and sees less of them
+        shorter = min(length_m / (2.0 * self.step_m), 1.0)
+        return float(np.quantile(off, max(1.0 - BENT / shorter, 0.0))) * shorter if len(off) else 0.0
 
     def meet(self, position_l: Array, direction_l: Array) -> tuple[Array, Mask]:
         """See `Surface.meet`.
@@ -342,3 +370,7 @@ class UnderAir:
     def slope(self, point_l: Array) -> Array:
         """See `Surface.slope`."""
         return self.surface.slope(point_l)
+
+    def bend_m(self, length_m: float) -> float:
+        """See `Surface.bend_m`."""
+        return self.surface.bend_m(length_m)

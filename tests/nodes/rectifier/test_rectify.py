@@ -398,10 +398,23 @@ def test_cells_behind_walls_are_left_out(flown, simulated, dem, folder, capsys):
     wrong = left_out[some] != hidden
     edge = ndimage.binary_dilation(left_out, iterations=3) & ~ndimage.binary_erosion(left_out, iterations=3)
     assert not (wrong & ~edge[some]).any() and wrong.mean() < 0.02
+    # cells that are seen have the grey of the pixel that sees them: rays stand closer than on smooth ground
+    xy = image[:, :2] * (-camera.focal_length_mm[ccd] / image[:, 2:])
+    sample = np.interp(xy[:, 1], *_ascending(camera.lines[ccd].xy_mm[:, 1]))
+    lines = np.concatenate([block.pixels for block in work.line_blocks(recording, "F", [strip.id])]).astype(float)
+    grey = ndimage.map_coordinates(lines, [0.5 * (early + late), sample], order=1)
+    off = np.abs(whole[some] - grey)[~hidden & ~edge[some]]
+    assert np.median(off) < 1.0 and (off > 0.1 * lines.std()).mean() < 0.05  # 2.7 and 0.15 with those of smooth ground
     # in a mosaic they stay empty, too, where no other strip sees them
     block = _rectify(capsys, flown, folder / "block.tif", *options, "--occlusions", "--mosaic", "--workers", "1")
     assert block["layers"][0]["hidden_cells"] == told["hidden_cells"]
     assert ((cells("block.tif")[0] == 0) == left_out).all()
+
+
+def _ascending(y_mm):
+    """Places and numbers of pixels, by place."""
+    order = np.argsort(y_mm)
+    return y_mm[order], order.astype(float)
 
 
 def test_refraction_moves_an_orthoimage_by_as_much_as_the_air_does(flown, folder, capsys):
