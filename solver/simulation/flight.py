@@ -102,7 +102,10 @@ class FlightPlan:
         if not 0 <= self.sidelap < 1:
             raise ValueError(f"flight plan: sidelap must be in [0, 1), got {self.sidelap}")
         if self.relief_m > 0.3 * self.height_m:
-            raise ValueError(f"flight plan: relief of {self.relief_m} m is too high for {self.height_m} m above ground")
+            raise ValueError(
+                f"flight plan: relief of {self.relief_m:g} m is too high for {self.height_m:g} m above ground, "
+                f"wanted at most {0.3 * self.height_m:g}"
+            )
 
         self._check_size()
 

@@ -12,6 +12,8 @@ Array = NDArray[np.floating]
 EARTH_RADIUS_M = 6.371e6
 #: Newton's steps of `Terrain.met`, and how small the last must be (it leaves an error of about its square), m.
 NEWTON_STEPS, MET_M = 3, 0.05
+#: Steps of the search from above along rays that the relief may be as steep as. Tuned: its shortest waves take several.
+SEARCH_STEPS, SEARCHED_TOGETHER = 256, 256
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,8 @@ class Terrain:
     def intersect(self, position_l: ArrayLike, direction_l: ArrayLike, tolerance_m: float = 1e-9) -> Array:
         """Ground points (n, 3) of rays from positions (n, 3) downward along directions (n, 3).
 
-        Heights are found to ``tolerance_m``.
+        Heights are found to ``tolerance_m``, from height to height along the ray; where the relief is as steep as the
+        ray, by a search from above.
 
         Raises
         ------
@@ -58,11 +61,42 @@ class Terrain:
             z = z + step
             if np.abs(step).max(initial=0.0) < tolerance_m:
                 break
-        lost = ~(np.abs(step) < tolerance_m)
-        if lost.any() or not (d[:, 2] < 0).all():
-            raise ValueError(f"{int((lost | (d[:, 2] >= 0)).sum())} rays do not come down to the ground")
+        down = d[:, 2] < 0
+        steep = np.flatnonzero(down & ~(np.abs(step) < tolerance_m))
+        z[steep] = self._first(origin[steep], slope[steep])
+        lost = ~np.isfinite(z)
+        if lost.any() or not down.all():
+            raise ValueError(f"{int((lost | ~down).sum())} rays do not come down to the ground")
         xy = origin[:, :2] + slope * (z - origin[:, 2])[:, None]
         return np.column_stack([xy, z])
+
+    def _first(self, origin: Array, slope: Array) -> Array:
+        """Heights (n,) at which rays first meet the ground, NaN where they do not: steps from above, then halving."""
+
+        relief = float(np.abs(self.amplitude_m).sum())
+        xy = origin[:, :2] + slope * (self.height_m - origin[:, 2])[:, None]
+        bend = (xy**2).sum(axis=1) / EARTH_RADIUS_M  # twice as far down as the Earth is bent there
+        begin = np.minimum(self.height_m + relief, origin[:, 2])
+        end = self.height_m - relief - bend
+        out = np.full(len(origin), np.nan)
+        for k in range(0, len(out), SEARCHED_TOGETHER):
+            some = slice(k, k + SEARCHED_TOGETHER)
+            z = np.linspace(begin[some], end[some], SEARCH_STEPS + 1, axis=1)
+            met = self._under(origin[some], slope[some], z)
+            first = np.argmax(met, axis=1)
+            rays = np.flatnonzero(met.any(axis=1) & (first > 0))  # the others begin below the ground
+            low, high = z[rays, first[rays]], z[rays, first[rays] - 1]
+            for _ in range(60):
+                middle = 0.5 * (low + high)
+                met = self._under(origin[some][rays], slope[some][rays], middle[:, None])[:, 0]
+                low, high = np.where(met, middle, low), np.where(met, high, middle)
+            out[k + rays] = low
+        return out
+
+    def _under(self, origin: Array, slope: Array, z: Array) -> NDArray[np.bool_]:
+        """Whether rays (n) are under the ground at heights (n, k)."""
+        x, y = (origin[:, i, None] + slope[:, i, None] * (z - origin[:, 2:]) for i in range(2))
+        return np.asarray(self.height(x, y) >= z)
 
     def met(self, position_l: Array, direction_l: Array) -> Array:
         """Heights (n,) at which rays from positions (n, 3) along directions (n, 3) meet the ground, to 0.1 mm.

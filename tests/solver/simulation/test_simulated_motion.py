@@ -166,6 +166,19 @@ def test_terrain_stays_in_range_and_is_cut_where_it_is():
         terrain.intersect(start, np.array([[0.5, 0.4, -1.0], [0.1, 0.0, 1.0]]))
 
 
+def test_a_relief_as_steep_as_the_rays_is_met_where_they_first_come_to_it():
+    """From height to height along the ray nothing comes to rest there: `simulate --relief 450` told of a fault."""
+    terrain, rng = fractal_terrain(np.random.default_rng(1), 0.0, 450.0), np.random.default_rng(2)
+    start = np.column_stack([rng.uniform(-3000, 3000, (600, 2)), np.full(600, 1500.0)])
+    direction = np.column_stack([rng.uniform(-0.9, 0.9, (600, 2)), np.full(600, -1.0)])
+    found = terrain.intersect(start, direction)
+    assert found[:, 2] == pytest.approx(terrain.height(found[:, 0], found[:, 1]), abs=1e-8)
+    assert np.cross(found - start, direction) == pytest.approx(0.0, abs=1e-6)
+    before = start[:, None] + np.linspace(0.001, 0.999, 1000)[:, None] * (found - start)[:, None]
+    assert (terrain.height(before[..., 0], before[..., 1]) < before[..., 2] + 1e-6).all()
+    assert terrain.met(start, direction) == pytest.approx(found[:, 2], abs=1e-3)
+
+
 @pytest.mark.parametrize(
     "bad",
     [
