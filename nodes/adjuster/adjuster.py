@@ -413,6 +413,7 @@ class Adjuster(Node):
             )  # fmt: skip
             if body.point:
                 self._window.add_look(body.point, look)
+                self._strips.look(image.strip, image.line, self._window)
             else:
                 self._outputs.refusals.append(Refusal("", look, "point without a name"))
 
@@ -512,6 +513,8 @@ class Adjuster(Node):
             now_s = min(now_s, self._window.trajectory.end_s)
         self._strips.use_to(now_s)
         self._take_ties()
+        if len(self._camera.lenses) == 1:  # lenses of one scene see it in strips that overlap in time
+            self._strips.end_forgotten(now_s, self._window)
         outputs = [self._log(text, warning=True) for text in self._strips.take_events()]
         outputs += [self._log(text) for text in self._control.take_news()]
         outputs += self._results(self._window.update(now_s))

@@ -16,6 +16,9 @@ from .poses import PoseBuffer, SlowHistory, least_noise
 NEAR_START_S = 1.0
 #: Smoothed poses reach back so far behind the first filtered one, s; where there is none a strip is joined later.
 REACHED_BACK_S = 10.0
+#: A strip whose end nobody tells is over when there has been no image point of it for so long, s, and another one has
+#: begun at least ``LEFT_S`` after the last. Two cameras that image at once begin together; a turn takes longer. Tuned.
+SILENT_S, LEFT_S = 30.0, 10.0
 
 
 class AdjustedStrips:
@@ -42,6 +45,7 @@ class AdjustedStrips:
         self.held_ties: list[tuple[Any, str]] = []
         self.events: list[str] = []
         self._held: dict[str, Any] = {}
+        self._looked: dict[str, tuple[float, float]] = {}  # newest line of strips that go on, and its time
         self._slow = SlowHistory()
         self._stated: dict[str, tuple[SlowErrors, SlowErrors]] = {}  # of each strip: of the whole, and now
         self._handed_s = self._used_to_s = -np.inf
@@ -54,6 +58,7 @@ class AdjustedStrips:
         self._handed_s = self._used_to_s = -np.inf
         self.poses.clear()
         self._held.clear()
+        self._looked.clear()
         self.held_ties.clear()
 
     @property
@@ -90,6 +95,38 @@ class AdjustedStrips:
             self._stated[body.id] = slow, slow
         if body.ended:
             window.end_strip(body.id, int(body.lines), first_s + body.lines / body.line_rate_hz)
+
+    def look(self, id: str, line: float, window: Window) -> None:
+        """An image point of a strip has come."""
+        strip = window.strips.get(id)
+        if strip is not None and not strip.ended and line > self._looked.get(id, (-1.0, 0.0))[0]:
+            self._looked[id] = line, float(strip.time_of(line))
+
+    def end_forgotten(self, now_s: float, window: Window) -> None:
+        """End strips whose end nobody has told: as long as one goes on, nothing is made whole, and no strip learns from
+        another one."""
+        for id, (line, newest_s) in list(self._looked.items()):
+            strip = window.strips[id]
+            if strip.ended:
+                del self._looked[id]
+                continue
+            later = [s for s in window.strips.values() if s.first_line_time_s > newest_s + LEFT_S]
+            if now_s < newest_s + SILENT_S or not later:
+                continue
+            # lines behind the last image point may have been seen by one view alone
+            most_s = min(newest_s + LEFT_S, min(s.first_line_time_s for s in later))
+            lines = max(int((most_s - strip.first_line_time_s) * strip.line_rate_hz), int(line) + 1)
+            body = type(self.bodies[id])()
+            body.CopyFrom(self.bodies[id])  # messages are shared with others
+            body.lines, body.ended = min(lines, strip.lines) if strip.lines else lines, True
+            self.bodies[id] = body
+            window.end_strip(id, int(body.lines))
+            self._counters["strip end not told"] += 1
+            self.events.append(
+                f"strip {id}: another one has begun, and nobody has told its end: over since its last image point, "
+                f"{newest_s - strip.first_line_time_s:.0f} s after its first line; "
+                "what images it has to send configuration/strip with ended"
+            )
 
     def held(self) -> list[Any]:
         """Strips that wait."""

@@ -33,6 +33,7 @@ class FoundStrips:
         self._end_ns: dict[str, int] = {}  # when the last line was imaged, of lines with times of their own
         self._off: set[str] = set()
         self._silent: set[str] = set()  # strips that have ended because no lines came
+        self._announced_ns: dict[str, int] = {}  # newest line of strips that were announced
 
     def __contains__(self, id: str) -> bool:
         return id in self._begun
@@ -71,6 +72,7 @@ class FoundStrips:
         """
         strip, own = self._begun.get(block.strip), block.line_times_ns is not None
         if strip is None:
+            self._announced_ns[block.strip] = max(self._announced_ns.get(block.strip, 0), stamp_ns)
             return "" if announced is None or own else self._told_off(announced, _off(announced, block), block)
         off = 0.0 if own else _off(strip, block)
         if abs(off) > OTHER_LINES:
@@ -109,6 +111,14 @@ class FoundStrips:
         self._silent.update(silent)
         others = [] if block is None else [id for id in self._newest_ns if id != block.strip]
         return [self._end(id) for id in dict.fromkeys((*silent, *others))]
+
+    def left_open(self, strip: str, stamp_ns: int) -> list[str]:
+        """Strips that were announced, and of which no lines have come for a while before those of another one, once."""
+        silent_ns = stamp_ns - round(STRIP_SILENT_S * SECOND_NS)
+        found = [id for id, newest_ns in self._announced_ns.items() if id != strip and newest_ns < silent_ns]
+        for id in found:
+            del self._announced_ns[id]
+        return found
 
     def finish(self) -> list[Any]:
         """Strips that have not ended yet."""

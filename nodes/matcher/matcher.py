@@ -411,6 +411,12 @@ class Matcher(Node):
             strip = self._strips[block.strip] = self._found.begin(block)
             out += self._ended(self._found.ended(self._stamp_ns, block))
             out += [self._strip(strip), self._log(f"{strip.id}: nobody announced it, found from its image lines")]
+        if self._matcher is not None and len(self._camera.lenses) == 1:  # else strips overlap in time
+            for id in self._found.left_open(block.strip, self._stamp_ns):
+                if not self._strips[id].ended:
+                    out += self._ties(self._matcher.end_strip(id), id)
+                    words = f"{id}: lines of {block.strip} come, none of its own do, and nobody has told its end"
+                    out.append(self._log(f"{words}: matched as if it were over", warning=True))
         off = self._found.note(block, self._stamp_ns, self._strips[block.strip])
         return out + ([self._log(off, warning=True)] if off else [])
 

@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
+from recording_file import write_recording
 from scipy.spatial.transform import Rotation
 
 from triline.nodes.adjuster.adjuster import Adjuster
@@ -240,6 +241,33 @@ def test_strips_of_one_ccd_line_in_any_direction_are_tied_by_their_images_alone(
     assert main(["adjust", str(out), "--json", "-o", str(tmp_path / "adjusted")]) == 0
     batch = json.loads(capsys.readouterr().out)
     assert batch["redundancy"] > 50 and batch["sigma0"] < 1.2
+
+
+def test_a_strip_of_one_ccd_line_whose_end_nobody_tells_is_tied(tmp_path):
+    """The program of the camera crashed and went on with another strip: nothing was tied, and nothing said why."""
+    sensor, flight, rest, out = (tmp_path / name for name in ("camera.json", "flight.mcap", "rest.mcap", "out.mcap"))
+    sensor.write_text(CAMERA)
+    plan = ["--strips", "2", "--sidelap", "0.6", "--seconds", "10", "--height", "1000", "--speed", "60", "--no-turns"]
+    simulate = ["simulate", "-q", "-o", str(flight), "--sensor", str(sensor), "--images", *plan, "--control", "0"]
+    assert main([*simulate, "--check", "0", "--lead-in", "6", "--lead-out", "6", "--seed", "3"]) == 0
+    messages = [
+        x for x in RecordingReader(flight).messages()
+        if not (x.topic == "configuration/strip" and x.body.ended and x.body.id == "S1")
+    ]  # fmt: skip
+    write_recording(rest, messages)
+    settings = tmp_path / "nodes.toml"
+    settings.write_text("[matcher]\nground_m = 0.0\n")
+    nodes = ["--nodes", "navigator,matcher,adjuster", "--processes", "1", "--config", str(settings)]
+    assert main(["process", str(rest), "-o", str(out), "-q", *nodes]) == 0
+    reader, seen = RecordingReader(out), {}
+    for tie in reader.messages(["observation/tie"]):
+        seen.setdefault(tie.body.point, set()).update(image.strip for image in tie.body.images)
+    assert sum(strips == {"S1", "S2"} for strips in seen.values()) > 60
+    told = [x.body.message for x in reader.messages(["event/log"])]
+    assert "S1: lines of S2 come, none of its own do, and nobody has told its end: matched as if it were over" in told
+    assert sum("strip S1: another one has begun, and nobody has told its end" in text for text in told) == 1
+    whole = {x.body.strip: x.stamp_ns for x in reversed(list(reader.messages(["orientation/whole"])))}
+    assert whole["S1"] < messages[-1].stamp_ns - 5_000_000_000 and "S2" in whole
 
 
 @pytest.mark.study
