@@ -110,7 +110,7 @@ class AdjustedStrips:
             if strip.ended:
                 del self._looked[id]
                 continue
-            later = [s for s in window.strips.values() if s.first_line_time_s > newest_s + LEFT_S]
+            later = [s for s in window.strips.values() if newest_s + LEFT_S < s.first_line_time_s <= now_s]
             if now_s < newest_s + SILENT_S or not later:
                 continue
             # lines behind the last image point may have been seen by one view alone

@@ -26,9 +26,9 @@ def messages():
     return out + [o for o in navigator.finish() if o.topic in Adjuster.inputs]
 
 
-def run(messages):
+def run(messages, **settings):
     """Outputs, each with when it came (s), and counters."""
-    node, out = Adjuster(grid_hz=2.0, pace="normal", update_s=0.5), []
+    node, out = Adjuster(grid_hz=2.0, pace="normal", update_s=0.5, **settings), []
     for message in messages:
         out += [((message.stamp_ns - EPOCH_NS) * 1e-9, o) for o in node.step(message)]
     return out + [(float("inf"), o) for o in node.finish()], node.counters
@@ -84,5 +84,10 @@ def test_strips_that_begin_together_go_on_without_image_points(messages):
     upto = next(k for k, x in enumerate(messages) if x.topic.endswith("strip") and x.body.id == "S2")
     given = [x for x in messages[:upto] if not ends(x, "S1")]
     given.insert(given.index(other) + 1, beside)
-    outputs, counters = run(given)
+    planned = type(other.body)()  # and the next strip is announced long before it begins
+    planned.CopyFrom(body)
+    planned.id, planned.first_line_time_ns = "S9", body.first_line_time_ns + 300_000_000_000
+    ahead = type(other)(other.topic, other.stamp_ns + 2, planned, other.source, other.sequence, other.start)
+    given.insert(given.index(beside) + 1, ahead)
+    outputs, counters = run(given, apriori="project")  # by the poses a strip waits for them
     assert not counters["strip end not told"] and not any("nobody has told" in str(o.body) for _, o in outputs)
