@@ -144,7 +144,7 @@ def test_where_no_processes_can_be_had_one_does_all(pair, monkeypatch, capsys):
     def none(*args, **kwargs):
         raise NotImplementedError("no semaphores here")
 
-    monkeypatch.setattr(control_runs, "ProcessPoolExecutor", none)
+    monkeypatch.setattr(control_runs, "WorkerPool", none)
     words = ["study", "control", str(pair), "-q", "--control", "4", "9", "--model", "dgr", "--selfcal", "none"]
     assert main([*words, "--jobs", "2"]) == 0
     assert "best: " in capsys.readouterr().out
