@@ -45,7 +45,7 @@ class AdjustedStrips:
         self.held_ties: list[tuple[Any, str]] = []
         self.events: list[str] = []
         self._held: dict[str, Any] = {}
-        self._looked: dict[str, tuple[float, float]] = {}  # newest line of strips that go on, and its time
+        self._looked: dict[str, float] = {}  # newest line with an image point, of strips that go on
         self._slow = SlowHistory()
         self._stated: dict[str, tuple[SlowErrors, SlowErrors]] = {}  # of each strip: of the whole, and now
         self._handed_s = self._used_to_s = -np.inf
@@ -99,23 +99,24 @@ class AdjustedStrips:
     def look(self, id: str, line: float, window: Window) -> None:
         """An image point of a strip has come."""
         strip = window.strips.get(id)
-        if strip is not None and not strip.ended and line > self._looked.get(id, (-1.0, 0.0))[0]:
-            self._looked[id] = line, float(strip.time_of(line))
+        if strip is not None and not strip.ended and line > self._looked.get(id, -1.0):
+            self._looked[id] = line
 
     def end_forgotten(self, now_s: float, window: Window) -> None:
         """End strips whose end nobody has told: as long as one goes on, nothing is made whole, and no strip learns from
         another one."""
-        for id, (line, newest_s) in list(self._looked.items()):
+        for id, line in list(self._looked.items()):
             strip = window.strips[id]
             if strip.ended:
                 del self._looked[id]
                 continue
-            later = [s for s in window.strips.values() if newest_s + LEFT_S < s.first_line_time_s <= now_s]
-            if now_s < newest_s + SILENT_S or not later:
+            newest_s = strip.first_line_time_s + line / strip.line_rate_hz
+            if now_s < newest_s + SILENT_S:
+                continue
+            if not any(newest_s + LEFT_S < s.first_line_time_s <= now_s for s in window.strips.values()):
                 continue
             # lines behind the last image point may have been seen by one view alone
-            most_s = min(newest_s + LEFT_S, min(s.first_line_time_s for s in later))
-            lines = max(int((most_s - strip.first_line_time_s) * strip.line_rate_hz), int(line) + 1)
+            lines = int(line + LEFT_S * strip.line_rate_hz) + 1
             body = type(self.bodies[id])()
             body.CopyFrom(self.bodies[id])  # messages are shared with others
             body.lines, body.ended = min(lines, strip.lines) if strip.lines else lines, True

@@ -137,7 +137,10 @@ def rays_of(camera: LineCamera, line: int, step: int = NODE_STEP, factor: int = 
 
 
 def step_over(surface: Surface, grid: GroundGrid) -> int:
-    """Pixels from one ray to the next, for a ground in cells about as large as the pixels: fewer where it has walls."""
+    """Pixels from one ray to the next, so that the ground between both is about straight: fewer where it has walls.
+
+    Cells are taken to be about as large as the pixels.
+    """
     step = NODE_STEP
     while step > LEAST_STEP and surface.bend_m(step * grid.cell_m) > OFF_CELLS * grid.cell_m:
         step //= 2

@@ -23,9 +23,9 @@ TOLERANCE_M, ROUNDS = 1e-3, 12
 STEPS_A_CELL, MOST_STEPS = 2.0, 4096
 #: Cells a side of the squares whose highest and steepest ground tells which rays are searched. Tuned.
 SQUARE_CELLS = 8
-#: Share of the heights that may be further off a straight line than `Surface.bend_m` says, and so many heights of a
-#: large grid tell it. Tuned: a few walls are enough.
-BENT, BENDS = 0.002, 1_000_000
+#: Share of the ground that may be further off a straight line than `Surface.bend_m` says (tuned: the walls of one house
+#: in 20 hectares are seen), and heights of a large grid that are looked at for it.
+BENT, BENDS = 0.0005, 1_000_000
 #: Rounds of a bent ray with the ground. Derived: the shift changes by 1e-4 of a change in height, which is itself the
 #: shift times the slope of the ground, so the second round leaves less than a millimetre.
 _AIR_ROUNDS = 2
@@ -53,7 +53,9 @@ class Surface(Protocol):
         ...
 
     def bend_m(self, length_m: float) -> float:
-        """How far its heights are off the straight lines between places so far apart, m: `BENT` of them by more."""
+        """How far the ground between two places so far apart is above or below the straight line between them, m; a
+        share `BENT` of it is further off.
+        """
         ...
 
 
@@ -124,7 +126,7 @@ class Ellipsoid:
         return -normal[..., :2] / normal[..., 2:]
 
     def bend_m(self, length_m: float) -> float:
-        """See `Surface.bend_m`; that of the Earth is left out."""
+        """See `Surface.bend_m`; the curvature of the Earth is left out."""
         return 0.0
 
 
@@ -186,7 +188,7 @@ class HeightField:
         return np.stack(out, axis=-1)
 
     def bend_m(self, length_m: float) -> float:
-        """See `Surface.bend_m`; in the middle between two nodes, of some rows and columns of a large grid."""
+        """See `Surface.bend_m`; in the middle of lines along rows and columns, of a large grid of some of them."""
         apart = max(round(0.5 * length_m / self.step_m), 1)
         found = []
         for z in (self.z_m, self.z_m.T):

@@ -12,7 +12,8 @@ Array = NDArray[np.floating]
 EARTH_RADIUS_M = 6.371e6
 #: Newton's steps of `Terrain.met`, and how small the last must be (it leaves an error of about its square), m.
 NEWTON_STEPS, MET_M = 3, 0.05
-#: Steps of the search from above along rays that the relief may be as steep as. Tuned: its shortest waves take several.
+#: Steps of the search from above along rays that the relief may be as steep as, and rays that are searched at once.
+#: Tuned: the shortest waves of a relief take several steps.
 SEARCH_STEPS, SEARCHED_TOGETHER = 256, 256
 
 
@@ -72,7 +73,6 @@ class Terrain:
 
     def _first(self, origin: Array, slope: Array) -> Array:
         """Heights (n,) at which rays first meet the ground, NaN where they do not: steps from above, then halving."""
-
         relief = float(np.abs(self.amplitude_m).sum())
         xy = origin[:, :2] + slope * (self.height_m - origin[:, 2])[:, None]
         bend = (xy**2).sum(axis=1) / EARTH_RADIUS_M  # twice as far down as the Earth is bent there

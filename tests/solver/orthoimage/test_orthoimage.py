@@ -20,7 +20,7 @@ from triline.solver.orthoimage.heights_of_points import heights_of_points
 from triline.solver.orthoimage.mosaic import Mosaic
 from triline.solver.orthoimage.orientation import LineOrientation
 from triline.solver.orthoimage.resampling import resample
-from triline.solver.orthoimage.strip import Patch, StripRectifier, rays_of
+from triline.solver.orthoimage.strip import Patch, StripRectifier, rays_of, step_over
 from triline.solver.orthoimage.surface import Ellipsoid, HeightField, Plane
 
 FRAME = LocalFrame(48.93, 8.96, 300.0)
@@ -424,6 +424,17 @@ def test_lines_that_see_no_ground_are_counted():
     image = np.ones((100, PIXELS), dtype=np.uint8)
     assert strip.add(0, image, None, flight.position(lines), flight.R(lines)) == [] and strip.finish() == []
     assert strip.missed == 100 * len(rays_of(CAMERA, 1).sample)
+
+
+def test_rays_stand_closer_where_the_ground_has_walls():
+    grid = GroundGrid(replace(FRAME, crs="local"), 0.5)
+    x, y = np.meshgrid(np.arange(0.0, 400.0, 2.0), np.arange(0.0, 600.0, 2.0))
+    hills = 40.0 * np.sin(x / 90.0) * np.cos(y / 120.0)
+    assert step_over(Plane(0.0), grid) == step_over(HeightField(0.0, 0.0, 2.0, hills), grid) == 16
+    house = HeightField(0.0, 0.0, 2.0, hills + 8.0 * ((np.abs(x - 200.0) < 15.0) & (np.abs(y - 300.0) < 20.0)))
+    assert step_over(house, grid) == 2
+    town = HeightField(0.0, 0.0, 2.0, hills + 8.0 * ((x % 50.0 < 30.0) & (y % 60.0 < 40.0)))
+    assert step_over(town, grid) == 2
 
 
 @pytest.mark.parametrize("oblique", [0.0, 0.5])
