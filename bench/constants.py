@@ -48,7 +48,7 @@ ROOMS = {
         "solver/window/**/*.py",
         "solver/adjustment/drift_hypotheses.py",
         "solver/adjustment/bias_search.py",
-        "solver/adjustment/dense_in_parts.py",
+        "solver/adjustment/frontal.py",
         "solver/adjustment/growing_normals.py",
         "solver/adjustment/pose_noise.py",
         "solver/adjustment/protection.py",

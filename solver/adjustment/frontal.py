@@ -8,15 +8,22 @@ points need them; libraries of sparse Cholesky factors leave them to the user.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.sparse import csr_array
 
 from ..arrays import Array, IntArray
+from .in_parts import Cost, Parts, in_one_go
 from .nested_dissection import Dissection
 from .reduced_system import RAISED, ROUNDING, Undetermined, cholesky, inverse_of, null_vectors, scale_of
+
+#: What a front costs besides its arithmetic, in floating point operations, about.
+FRONT = 2e5
+#: Rows of what is left of a front that are worked on together, and from what cost on they are a part of their own.
+ROWS, LARGE = 512, 2e8
 
 
 class FrontalMatrix:
@@ -36,7 +43,7 @@ class FrontalMatrix:
             order = np.argsort(place)
             place, block = place[order], block[np.ix_(order, order)]
         for t, low, high in pieces(self.dissection, place):
-            rows = self._local(t, place[low:])
+            rows = self.dissection.local(t, place[low:])
             self.panels[t][np.ix_(rows, rows[: high - low])] -= block[low:, low:high]
 
     def add_each(self, columns: IntArray, blocks: Array) -> None:
@@ -54,13 +61,7 @@ class FrontalMatrix:
         for t in np.unique(front).tolist():
             own = lower[limits[t] : limits[t + 1]]
             at = column[own] - self.dissection.bounds[t]
-            np.add.at(self.panels[t], (self._local(t, row[own]), at), entries.data[own])
-
-    def _local(self, t: int, place: IntArray) -> IntArray:
-        """Rows of a panel that places stand in."""
-        first, end = self.dissection.bounds[t], self.dissection.bounds[t + 1]
-        below = np.searchsorted(self.dissection.rows[t], place) + (end - first)
-        return np.where(place < end, place - first, below)
+            np.add.at(self.panels[t], (self.dissection.local(t, row[own]), at), entries.data[own])
 
     def damp(self, damping: float) -> None:
         for panel in self.panels:
@@ -82,6 +83,74 @@ class FrontalMatrix:
         return FrontalFactor(self.dissection, self.panels, self.reference)
 
 
+class Fronts:
+    """Elimination front by front: what is left of one is added to the one it hangs on.
+
+    Parameters
+    ----------
+    dissection : order and fronts
+    panels : columns of the matrix, not changed
+    """
+
+    def __init__(self, dissection: Dissection, panels: list[Array]):
+        self._dissection, self._panels = dissection, panels
+        self._waiting: list[list[tuple[IntArray, Array]]] = [[] for _ in panels]
+
+    def assembled(self, t: int) -> Array:
+        """A front (own + rows, own + rows): its lower triangle, with what those that hang on it have left."""
+        panel = self._panels[t]
+        front = np.zeros((len(panel), len(panel)))
+        front[:, : panel.shape[1]] = panel
+        for rows, rest in self._waiting[t]:
+            at = self._dissection.local(t, rows)
+            front[np.ix_(at, at)] += rest
+        self._waiting[t] = []
+        return front
+
+    def eliminating(self, t: int, front: Array, L: Array) -> Generator[Cost, None, Array]:
+        """Columns (own + rows, own) of the factor, given that of the own unknowns; in parts."""
+        d, size, own = self._dissection, len(front), len(L)
+        factor = np.empty((size, own))
+        factor[:own] = L
+        cost = FRONT + own**3 / 3.0
+        if size > own:
+            below = factor[own:]
+            below[:] = solve_triangular(L, front[own:, :own].T, lower=True, check_finite=False).T
+            cost += float(own) ** 2 * (size - own)
+            if d.parent[t] >= 0:
+                rest = front[own:, own:].copy()
+                for begin in range(0, size - own, ROWS):
+                    rest[begin : begin + ROWS] -= below[begin : begin + ROWS] @ below.T
+                    cost += 2.0 * min(ROWS, size - own - begin) * (size - own) * own
+                    if cost > LARGE:
+                        yield cost
+                        cost = 0.0
+                self._waiting[int(d.parent[t])].append((d.rows[t], rest))
+        yield cost
+        return factor
+
+
+@dataclass(frozen=True)
+class Root:
+    """Functions of unknowns as `FrontalFactor.rooted` makes them.
+
+    Attributes
+    ----------
+    parts : by front, (own, k)
+    null : (k, q) of directions without information, which cofactors have no part in
+    """
+
+    parts: dict[int, Array]
+    null: Array
+
+    def joint(self, other: Root) -> Array:
+        """Cofactors (k, l) between these functions and others of the same factor."""
+        found = -self.null @ other.null.T
+        for t in self.parts.keys() & other.parts.keys():
+            found += self.parts[t].T @ other.parts[t]
+        return found
+
+
 class FrontalFactor:
     """Cholesky factor in fronts; see `reduced_system.Factor`.
 
@@ -96,12 +165,23 @@ class FrontalFactor:
     """
 
     def __init__(self, dissection: Dissection, panels: list[Array], reference: Array):
+        in_one_go(self._making(dissection, panels, reference))
+
+    @classmethod
+    def in_parts(
+        cls, dissection: Dissection, panels: list[Array], reference: Array
+    ) -> Generator[Cost, None, FrontalFactor]:
+        """The same, in parts, each with what it costs."""
+        factor = cls.__new__(cls)
+        yield from factor._making(dissection, panels, reference)
+        return factor
+
+    def _making(self, dissection: Dissection, panels: list[Array], reference: Array) -> Parts:
         self.dissection = dissection
-        n = len(dissection.position)
+        n, bounds = len(dissection.position), dissection.bounds
         scale = scale_of(reference)
         self._scale = scale  # in the order of the fronts
         self.scale = scale[dissection.position]
-        bounds = dissection.bounds
         for t, panel in enumerate(panels):
             own = slice(int(bounds[t]), int(bounds[t + 1]))
             panel *= np.concatenate([scale[own], scale[dissection.rows[t]]])[:, None]
@@ -109,48 +189,27 @@ class FrontalFactor:
         self._z: list[Array] | None = None
         self._null, values = np.empty((n, 0)), np.empty(0)
         self._panels = panels
-        if not self._factorise(0.0, 10 * ROUNDING):
-            self._factorise(RAISED, 0.0)
+        if not (yield from self._factorising(0.0, 10 * ROUNDING)):
+            yield from self._factorising(RAISED, 0.0)
             values, self._null = null_vectors(self._solve, n)
             if not len(values):
-                self._factorise(0.0, 0.0)
+                yield from self._factorising(0.0, 0.0)
         del self._panels
         vectors = self._null[dissection.position]
         vectors = vectors / np.abs(vectors).max(axis=0, initial=1e-300)
         self.undetermined = Undetermined(vectors, values, self.scale)
 
-    def _factorise(self, raised: float, limit: float) -> bool:
+    def _factorising(self, raised: float, limit: float) -> Generator[Cost, None, bool]:
         """Factor with the diagonal raised; whether all squared pivots are above the limit."""
-        d = self.dissection
-        count = len(self._panels)
         self._L: list[Array] = []
-        waiting: list[list[tuple[IntArray, Array]]] = [[] for _ in range(count)]
-        for t, panel in enumerate(self._panels):
-            own, size = panel.shape[1], len(panel)
-            front = np.zeros((size, size))
-            front[:, :own] = panel
-            for rows, rest in waiting[t]:
-                at = self._local(t, rows)
-                front[np.ix_(at, at)] += rest
-            waiting[t] = []
-            L, sound = cholesky(front[:own, :own], raised, limit)
+        fronts = Fronts(self.dissection, self._panels)
+        for t in range(len(self._panels)):
+            front = fronts.assembled(t)
+            L, sound = cholesky(front[: self._panels[t].shape[1], : self._panels[t].shape[1]], raised, limit)
             if not sound:
                 return False
-            factor = np.empty((size, own))
-            factor[:own] = L
-            if size > own:
-                below = solve_triangular(L, front[own:, :own].T, lower=True, check_finite=False).T
-                factor[own:] = below
-                if d.parent[t] >= 0:
-                    rest = front[own:, own:] - below @ below.T
-                    waiting[int(d.parent[t])].append((d.rows[t], rest))
-            self._L.append(factor)
+            self._L.append((yield from fronts.eliminating(t, front, L)))
         return True
-
-    def _local(self, t: int, place: IntArray) -> IntArray:
-        d = self.dissection
-        first, end = d.bounds[t], d.bounds[t + 1]
-        return np.where(place < end, place - first, np.searchsorted(d.rows[t], place) + (end - first))
 
     def _solve(self, b: Array) -> Array:
         """Solve with the (raised) scaled factor, in the order of the fronts; (n,) or (n, m)."""
@@ -177,40 +236,79 @@ class FrontalFactor:
         x -= self._null @ (self._null.T @ x)
         return (scale * x)[self.dissection.position]
 
-    def _selected(self) -> list[Array]:
-        """Columns (own + rows, own) of the scaled inverse, from the last front to the first."""
+    def selecting(self) -> Parts:
+        """Compute the cofactors of unknowns that meet, if that has not been done, in parts."""
         if self._z is None:
-            d, count = self.dissection, len(self._L)
-            z: list[Array] = [np.empty(0)] * count
-            whole: dict[int, Array] = {}  # inverse over own and rows, of fronts that others hang on
-            left = np.bincount(d.parent[d.parent >= 0], minlength=count)
-            for t in range(count - 1, -1, -1):
-                factor = self._L[t]
-                size, m = factor.shape
-                own = inverse_of(factor[:m])
-                columns = np.empty((size, m))
-                below = np.empty((0, 0))
-                if size > m:
-                    up = int(d.parent[t])
-                    at = self._local(up, d.rows[t])
-                    below = whole[up][np.ix_(at, at)]
-                    X = solve_triangular(factor[:m], factor[m:].T, lower=True, trans=1, check_finite=False).T
-                    columns[m:] = -below @ X
-                    own = own - X.T @ columns[m:]
-                columns[:m] = 0.5 * (own + own.T)
-                z[t] = columns
-                if d.parent[t] >= 0:
-                    left[d.parent[t]] -= 1
-                    if not left[d.parent[t]]:
-                        whole.pop(int(d.parent[t]), None)
-                if left[t]:
-                    full = np.empty((size, size))
-                    full[:, :m] = columns
-                    full[:m, m:] = columns[m:].T
-                    full[m:, m:] = below
-                    whole[t] = full
+            z = yield from self._inverse()
             self._z = z
+
+    def forget_selected(self) -> None:
+        """Let the memory of the cofactors go; they are computed anew when they are asked for."""
+        self._z = None
+
+    def _selected(self) -> list[Array]:
+        in_one_go(self.selecting())
+        assert self._z is not None
         return self._z
+
+    def _inverse(self) -> Generator[Cost, None, list[Array]]:
+        """Columns (own + rows, own) of the scaled inverse, from the last front to the first."""
+        d, count = self.dissection, len(self._L)
+        z: list[Array] = [np.empty(0)] * count
+        whole: dict[int, Array] = {}  # inverse over own and rows, of fronts that others hang on
+        left = np.bincount(d.parent[d.parent >= 0], minlength=count)
+        for t in range(count - 1, -1, -1):
+            factor = self._L[t]
+            size, m = factor.shape
+            own = inverse_of(factor[:m])
+            columns = np.empty((size, m))
+            below = np.empty((0, 0))
+            if size > m:
+                up = int(d.parent[t])
+                at = d.local(up, d.rows[t])
+                below = whole[up][np.ix_(at, at)]
+                X = solve_triangular(factor[:m], factor[m:].T, lower=True, trans=1, check_finite=False).T
+                columns[m:] = -below @ X
+                own = own - X.T @ columns[m:]
+            columns[:m] = 0.5 * (own + own.T)
+            z[t] = columns
+            if d.parent[t] >= 0:
+                left[d.parent[t]] -= 1
+                if not left[d.parent[t]]:
+                    whole.pop(int(d.parent[t]), None)
+            if left[t]:
+                full = np.empty((size, size))
+                full[:, :m] = columns
+                full[:m, m:] = columns[m:].T
+                full[m:, m:] = below
+                whole[t] = full
+            yield FRONT + 2.0 * size * size * m
+        return z
+
+    def rooted(self, columns: IntArray, functions: Array) -> Root:
+        """Functions (k, m) of some unknowns (m,), so that `Root.joint` gives the cofactors between any two of them.
+
+        It is ``L^-1 F^T``, which is zero but on the way from the unknowns' fronts to the last one.
+        """
+        d, k = self.dissection, len(functions)
+        place = d.position[columns]
+        scaled = functions * self._scale[place]
+        waiting: dict[int, Array] = {}
+        order = np.argsort(place)
+        for t, low, high in pieces(d, place[order]):
+            waiting[t] = np.zeros((len(self._L[t]), k))
+            waiting[t][place[order[low:high]] - d.bounds[t]] = scaled[:, order[low:high]].T
+        parts: dict[int, Array] = {}
+        while waiting:
+            t = min(waiting)
+            b, factor = waiting.pop(t), self._L[t]
+            m = factor.shape[1]
+            parts[t] = solve_triangular(factor[:m], b[:m], lower=True, check_finite=False)
+            if len(factor) > m:
+                up = int(d.parent[t])
+                above = waiting.setdefault(up, np.zeros((len(self._L[up]), k)))
+                above[d.local(up, d.rows[t])] += b[m:] - factor[m:] @ parts[t]
+        return Root(parts, scaled @ self._null[place] / np.sqrt(RAISED))
 
     def cofactors(self, columns: IntArray) -> Array:
         """Block (m, m) of the cofactor matrix; cheap where all of the unknowns meet."""
@@ -224,10 +322,8 @@ class FrontalFactor:
             later = sorted_place[high:]
             at = np.searchsorted(d.rows[t], later)
             if len(later) and not (at.max() < len(d.rows[t]) and (d.rows[t][at] == later).all()):
-                unit = np.zeros((len(d.position), len(columns)))
-                unit[columns, np.arange(len(columns))] = 1.0
-                whole = self.solve(unit)[columns]
-                return 0.5 * (whole + whole.T)
+                root = self.rooted(columns, np.eye(len(columns)))
+                return root.joint(root)
             m = z[t].shape[1]
             own = sorted_place[low:high] - d.bounds[t]
             Q[low:high, low:high] = z[t][np.ix_(own, own)]
@@ -260,5 +356,5 @@ def pieces(dissection: Dissection, place: IntArray) -> list[tuple[int, int, int]
     """Fronts that ascending places (k,) belong to, each with the range of these places."""
     front = np.searchsorted(dissection.bounds, place, side="right") - 1
     starts = np.flatnonzero(np.diff(front, prepend=-1))
-    ends = np.append(starts[1:], len(place))
+    ends = np.append(starts, len(place))[1:]
     return [(int(front[low]), int(low), int(high)) for low, high in zip(starts, ends, strict=True)]

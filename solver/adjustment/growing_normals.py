@@ -1,126 +1,156 @@
-"""Normal equations of a block of strips and their solution, in buffers that are kept.
+"""Normal equations of a block of strips, which grow while strips are flown and shrink when one is closed.
 
-The equations grow while a strip is flown and shrink when one is closed, hour after hour. Matrices of their own for
-strips and pairs of strips, made and given back with each strip, would leave gaps in memory that nothing else fits into.
-So all unknowns stand in the lower triangle of one matrix, row after row without the other half, in which they move up
-when others go, and a second buffer holds whatever a solution or an elimination needs. Both only grow.
+Looks tie an unknown of a strip to those some seconds before and after it, and to those of other strips that see the
+same ground, so nearly all of a large matrix is zero. It is kept in square cells of `CELL` unknowns with consecutive
+numbers, those only that something is known of. All cells stand in one array in which the place of one that is gone is
+taken by the next: matrices of their own, made and given back hour after hour, would leave gaps in memory that nothing
+else fits into. A solution takes the unknowns apart by nested dissection, in fronts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from typing import TypeVar
+from collections.abc import Generator, Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.sparse import csr_array
 
-from ..arrays import Array, IntArray
-from .dense_in_parts import Cost, Parts, factorised, inverted, reduced, solved
-from .reduced_system import DenseFactor
+from ..arrays import Array, Bools, IntArray
+from .frontal import FrontalFactor, Fronts
+from .in_parts import Cost, Parts
+from .nested_dissection import Dissection, find_fronts
+from .reduced_system import ROUNDING, cholesky, scale_of
 
-#: Unknowns that there is room for at first, and the factor by which the room grows. Memory that nothing was written to
-#: is not taken from the system.
-ROOM, GROWTH = 512, 1.5
-#: Rows worked on in one part.
-ROWS = 256
-#: Cost of looking up an element, in floating point operations, about.
-LOOKED_UP = 500.0
+#: Unknowns of a cell, some seconds of a strip. Tuned: half and twice as many take about as long.
+CELL = 48
+#: Cells that there is room for at first, and the factor by which the room grows. Memory that nothing was written to is
+#: not taken from the system.
+ROOM, GROWTH = 64, 1.5
+#: Unknowns of a front, at most, so that its elimination is no long part.
+OWN = 256
+#: Cost of looking up a cell, in floating point operations, about.
+LOOKED_UP = 2e4
+
+
+@dataclass(frozen=True)
+class _Groups:
+    """Unknowns of the same cell: ``members[begin[g] : begin[g + 1]]`` of group g, of ``cell[g]``."""
+
+    cell: list[int]
+    members: IntArray
+    begin: list[int]
+    of_unknown: IntArray
+    kept: Bools
+
+    def of(self, g: int) -> IntArray:
+        return self.members[self.begin[g] : self.begin[g + 1]]
 
 
 class BlockNormals:
-    """See the module; unknowns go by their numbers, in any order.
-
-    Attributes
-    ----------
-    numbers : (n,) of the unknowns that something is known of, as they came
-    """
+    """See the module; unknowns go by their numbers, in any order."""
 
     def __init__(self) -> None:
-        self.numbers: IntArray = np.empty(0, dtype=np.int64)
-        self._order: IntArray = np.empty(0, dtype=np.int64)
-        self._lower, self._rhs = np.zeros(_begin(ROOM)), np.zeros(ROOM)
-        self._memory = np.empty(0)
+        self._row: dict[int, int] = {}  # of a cell in the arrays of its unknowns
+        self._slot: dict[tuple[int, int], int] = {}  # of two cells, the later one first, among the blocks
+        self._rhs, self._known = np.zeros((ROOM, CELL)), np.zeros((ROOM, CELL), dtype=bool)
+        self._blocks = np.zeros((ROOM, CELL, CELL))
+        self._free_rows: list[int] = list(range(ROOM - 1, -1, -1))
+        self._free_slots: list[int] = list(range(ROOM - 1, -1, -1))
+
+    @property
+    def numbers(self) -> IntArray:
+        """(n,) of the unknowns that something is known of, ascending."""
+        return self._known_in(self._row)
+
+    def _known_in(self, cells: Iterable[int]) -> IntArray:
+        """Numbers, ascending, of the unknowns of cells that something is known of."""
+        parts = [cell * CELL + np.flatnonzero(self._known[self._row[cell]]) for cell in sorted(cells)]
+        return np.concatenate([np.empty(0, dtype=np.int64), *parts])
 
     def __len__(self) -> int:
-        return len(self.numbers)
-
-    def _places(self, numbers: IntArray) -> IntArray:
-        """Places of unknowns; -1 where nothing is known of one."""
-        if not len(self.numbers):
-            return np.full(len(numbers), -1, dtype=np.int64)
-        at = np.searchsorted(self.numbers, numbers, sorter=self._order)
-        place = self._order[np.minimum(at, len(self._order) - 1)]
-        return np.where(self.numbers[place] == numbers, place, -1)
-
-    def _enter(self, numbers: IntArray) -> IntArray:
-        """Places of unknowns, with room for those that are new."""
-        place = self._places(numbers)
-        new = place < 0
-        if new.any():
-            before = len(self.numbers)
-            self.numbers = np.concatenate([self.numbers, numbers[new]])
-            if len(self.numbers) > len(self._rhs):
-                self._make_room(before, len(self.numbers))
-            self._order = np.argsort(self.numbers)
-            place[new] = np.arange(before, len(self.numbers))
-        return place
-
-    def _make_room(self, old: int, n: int) -> None:
-        size = max(n, int(GROWTH * len(self._rhs)))
-        lower, rhs = np.zeros(_begin(size)), np.zeros(size)
-        lower[: _begin(old)], rhs[:old] = self._lower[: _begin(old)], self._rhs[:old]
-        self._lower, self._rhs = lower, rhs
+        return int(self._known.sum())
 
     def add(self, numbers: IntArray, matrix: Array, rhs: Array) -> None:
         """Add information (u, u), (u,) about different unknowns (u,)."""
-        place = self._enter(numbers)
-        self._rhs[place] += rhs
-        order = np.argsort(place)
-        place, matrix = place[order], matrix.take(order, axis=0).take(order, axis=1)
-        lower = np.tri(len(order), dtype=bool)
-        self._lower[(_begin(place)[:, None] + place)[lower]] += matrix[lower]
+        cells, of = np.unique(numbers // CELL, return_inverse=True)
+        within = numbers % CELL
+        rows = np.array([self._enter(cell) for cell in cells.tolist()], dtype=np.int64)[of]
+        self._rhs[rows, within] += rhs
+        self._known[rows, within] = True
+        slots = np.zeros((len(cells), len(cells)), dtype=np.int64)
+        for i, later in enumerate(cells.tolist()):
+            for k, earlier in enumerate(cells[: i + 1].tolist()):
+                slots[i, k] = self._pair(later, earlier)
+        lower = of[:, None] >= of
+        place = (slots[np.ix_(of, of)] * CELL + within[:, None]) * CELL + within
+        self._blocks.reshape(-1)[place[lower]] += matrix[lower]
 
-    def _row(self, place: int, others: IntArray) -> Array:
-        """Elements (m,) of a row."""
-        return self._lower.take(_begin(np.maximum(place, others)) + np.minimum(place, others))
+    def _enter(self, cell: int) -> int:
+        row = self._row.get(cell)
+        if row is None:
+            if not self._free_rows:
+                n = len(self._rhs)
+                self._rhs, self._known = _larger(self._rhs), _larger(self._known)
+                self._free_rows = list(range(len(self._rhs) - 1, n - 1, -1))
+            row = self._row[cell] = self._free_rows.pop()
+        return row
+
+    def _pair(self, later: int, earlier: int) -> int:
+        slot = self._slot.get((later, earlier))
+        if slot is None:
+            if not self._free_slots:
+                n = len(self._blocks)
+                self._blocks = _larger(self._blocks)
+                self._free_slots = list(range(len(self._blocks) - 1, n - 1, -1))
+            slot = self._slot[later, earlier] = self._free_slots.pop()
+        return slot
+
+    def matrix(self, numbers: IntArray) -> Array:
+        """(n, n) of unknowns, all of it; 0 where nothing is known."""
+        found = np.zeros((len(numbers), len(numbers)))
+        cell, within = numbers // CELL, numbers % CELL
+        for (later, earlier), slot in self._slot.items():
+            rows, columns = np.flatnonzero(cell == later), np.flatnonzero(cell == earlier)
+            part = self._blocks[slot][np.ix_(within[rows], within[columns])]
+            found[np.ix_(rows, columns)], found[np.ix_(columns, rows)] = part, part.T
+        return found
 
     def rhs(self, numbers: IntArray) -> Array:
         """Right-hand side (n,) of unknowns; 0 where nothing is known."""
-        place = self._places(numbers)
-        return np.where(place >= 0, self._rhs[place], 0.0)
+        rows = np.array([self._row.get(cell, -1) for cell in (numbers // CELL).tolist()], dtype=np.int64)
+        return np.where(rows >= 0, self._rhs[rows, numbers % CELL], 0.0)
 
-    def lower(self, numbers: IntArray, out: Array, rows: range) -> None:
-        """Put rows of the matrix of unknowns (n,) into the lower triangle of ``out`` (n, n); the upper one stays."""
-        place = self._places(numbers)
-        known = np.flatnonzero(place >= 0)
-        for i in rows:
-            out[i, : i + 1] = 0.0
-            if place[i] >= 0:
-                here = known[: np.searchsorted(known, i, side="right")]
-                out[i, here] = self._row(int(place[i]), place[here])
+    def work(self, numbers: IntArray) -> Dissection:
+        """How a solution of unknowns (n,), ascending, takes them apart."""
+        groups = self._groups(numbers, np.empty(0, dtype=np.int64))
+        return self._dissect(groups)
 
-    def solving(self, numbers: IntArray, weight: Array) -> Generator[Cost, None, tuple[Array, Array]]:
-        """Values (n,) and cofactors (n, n) of unknowns, where all others are zero.
+    def solving(self, numbers: IntArray, weight: Array) -> Generator[Cost, None, tuple[Array, FrontalFactor]]:
+        """Values (n,) of unknowns (n,), ascending, and the factor of their equations, where all others are zero.
 
-        In parts, each with what it costs. The cofactors last until the next solution or elimination.
+        In parts, each with what it costs.
 
         Parameters
         ----------
         weight : (n,) of each unknown as an observation of zero, beside the equations
         """
-        n = len(numbers)
-        N = self._kept(n * n).reshape(n, n)
-        rhs, scale = yield from self._equations(numbers, weight, N)
-        try:
-            yield from factorised(N)
-        except np.linalg.LinAlgError:  # something is hardly determined, even beforehand
-            rhs, scale = yield from self._equations(numbers, weight, N)
-            factor = DenseFactor(np.tril(N) + np.tril(N, -1).T)
-            N[:] = factor.inverse() * scale[:, None] * scale
-            return scale * factor.solve(rhs), N
-        values = scale * solved(N, rhs)
-        yield from inverted(N, scale)
-        return values, N
+        groups = self._groups(numbers, np.empty(0, dtype=np.int64))
+        dissection = self._dissect(groups)
+        panels = yield from self._panels(groups, numbers, weight, dissection)
+        reference = np.concatenate([np.diagonal(panel) for panel in panels])
+        factor = yield from FrontalFactor.in_parts(dissection, panels, reference)
+        yield from factor.selecting()
+        return factor.solve(self.rhs(numbers)), factor
+
+    def met(self, numbers: IntArray) -> IntArray:
+        """Numbers, ascending, of the unknowns in cells that unknowns (n,) have entries with, without these."""
+        own = set((numbers // CELL).tolist())
+        cells = {b if a in own else a for a, b in self._slot if (a in own) or (b in own)} | own
+        parts = [
+            cell * CELL + np.flatnonzero(self._known[self._row[cell]]) for cell in sorted(cells & self._row.keys())
+        ]
+        return np.setdiff1d(np.concatenate([np.empty(0, dtype=np.int64), *parts]), numbers)
 
     def close(self, numbers: IntArray, weight: Array) -> Parts:
         """Let unknowns (n,) go, of which nothing else will be said: what they say of others stays (Schur complement).
@@ -135,72 +165,126 @@ class BlockNormals:
         ------
         numpy.linalg.LinAlgError : unknowns that are undetermined
         """
-        n = len(numbers)
-        memory = self._kept(n * (n + len(self)))
-        own = memory[: n * n].reshape(n, n)
-        rhs, scale = yield from self._equations(numbers, weight, own)
-        yield from factorised(own)
-        gone = self._places(numbers)
-        stay = np.setdiff1d(np.arange(len(self)), gone)
-        known = np.flatnonzero(gone >= 0)
-        tied = np.zeros(len(stay), dtype=bool)
-        for place in gone[known].tolist():
-            tied |= self._row(place, stay) != 0.0
-        at = stay[tied]
-        yield LOOKED_UP * len(known) * len(stay)
-        through = memory[n * n :][: n * len(at)].reshape(n, len(at))
-        through[:] = 0.0
-        for i in known.tolist():
-            through[i] = self._row(int(gone[i]), at) * scale[i]
-        yield LOOKED_UP * len(known) * len(at)
-        yield from reduced(own, through)
-        self._rhs[at] -= through.T @ solve_triangular(own, rhs, lower=True, check_finite=False)
-        for begin in range(0, len(at), ROWS):
-            part = slice(begin, begin + ROWS)
-            less = through[:, part].T @ through[:, : begin + ROWS]
-            for i, row in enumerate(at[part].tolist()):
-                self._lower[_begin(row) + at[: begin + i + 1]] -= less[i, : begin + i + 1]
-            yield 2.0 * n * less.size
+        met = self.met(numbers)
+        every = np.union1d(numbers, met)
+        heavy = np.zeros(len(every))
+        heavy[np.searchsorted(every, numbers)] = weight
+        groups = self._groups(every, met)
+        d = self._dissect(groups)
+        panels = yield from self._panels(groups, every, heavy, d)
+        rhs = np.empty(len(every))
+        rhs[d.position] = self.rhs(every)
+        own = int(d.bounds[-2]) if len(met) else len(every)
+        scale = scale_of(np.concatenate([np.diagonal(panel) for panel in panels]))
+        scale[own:] = 1.0
+        fronts = Fronts(d, panels)
+        for t in range(len(panels) - bool(len(met))):
+            here = slice(int(d.bounds[t]), int(d.bounds[t + 1]))
+            panels[t] *= np.concatenate([scale[here], scale[d.rows[t]]])[:, None]
+            panels[t] *= scale[here]
+            front, m = fronts.assembled(t), panels[t].shape[1]
+            L, sound = cholesky(front[:m, :m], 0.0, 10 * ROUNDING)
+            if not sound:
+                raise np.linalg.LinAlgError("unknowns that are to be closed are undetermined")
+            factor = yield from fronts.eliminating(t, front, L)
+            y = solve_triangular(L, rhs[here] * scale[here], lower=True, check_finite=False)
+            rhs[d.rows[t]] -= (factor[m:] @ y) / scale[d.rows[t]]
         self.drop(numbers)
+        if len(met):
+            panels[-1][:] = 0.0
+            less = fronts.assembled(len(panels) - 1)
+            place = d.position[np.searchsorted(every, met)] - own
+            less = less[np.ix_(place, place)]
+            self.add(met, less, rhs[own:][place] - self.rhs(met))
+            yield 10.0 * less.size
 
-    def _equations(self, numbers: IntArray, weight: Array, out: Array) -> Generator[Cost, None, tuple[Array, Array]]:
-        """Put the equations of unknowns (n,) into the lower triangle of ``out`` (n, n), scaled to a diagonal of one;
-        returns the scaled right-hand side (n,) and the scale (n,)."""
-        n = len(numbers)
-        for begin in range(0, n, ROWS):
-            rows = range(begin, min(begin + ROWS, n))
-            self.lower(numbers, out, rows)
-            yield LOOKED_UP * len(rows) * rows.stop
-        out[np.arange(n), np.arange(n)] += weight
-        diagonal = out.diagonal()
-        scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-        for row in range(n):
-            out[row, : row + 1] *= scale[row] * scale[: row + 1]
-        return self.rhs(numbers) * scale, scale
+    def _groups(self, numbers: IntArray, kept: IntArray) -> _Groups:
+        """Unknowns (n,), ascending, by cells, with those that are kept apart from the others."""
+        key = 2 * (numbers // CELL) + np.isin(numbers, kept)
+        keys, of = np.unique(key, return_inverse=True)
+        begin = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=len(keys)))]).tolist()
+        return _Groups((keys // 2).tolist(), np.argsort(of, kind="stable"), begin, of, keys % 2 == 1)
 
-    def _kept(self, size: int) -> Array:
-        """Memory (size,) that is used again and again, whatever it holds; what was asked for before is no more."""
-        if size > len(self._memory):
-            self._memory = np.empty(0)  # first let go of the old one
-            self._memory = np.empty(size + size // 8)  # a strip is a little longer than another
-        return self._memory[:size]
+    def _pairs(self, groups: _Groups) -> list[tuple[int, int, int]]:
+        """Groups that meet, each pair once, the one of the later cell first, and the slot of their cells."""
+        of_cell: dict[int, list[int]] = {}
+        for g, cell in enumerate(groups.cell):
+            of_cell.setdefault(cell, []).append(g)
+        none: list[int] = []
+        return [
+            (g, h, slot)
+            for (a, b), slot in self._slot.items()
+            for g in of_cell.get(a, none)
+            for h in of_cell.get(b, none)
+            if a != b or g >= h
+        ]
+
+    def _dissect(self, groups: _Groups) -> Dissection:
+        pairs = self._pairs(groups)
+        own = range(len(groups.cell))
+        row = np.array([*own, *(p[0] for p in pairs), *(p[1] for p in pairs)])
+        column = np.array([*own, *(p[1] for p in pairs), *(p[0] for p in pairs)])
+        graph = csr_array((np.ones(len(row)), (row, column)), shape=(len(own), len(own)))
+        last = groups.kept if groups.kept.any() else None
+        return find_fronts(graph, groups.of_unknown, np.diff(groups.begin), last, OWN)
+
+    def _panels(
+        self, groups: _Groups, numbers: IntArray, weight: Array, dissection: Dissection
+    ) -> Generator[Cost, None, list[Array]]:
+        """The equations of unknowns (n,) as columns of the fronts, without what each says of its own unknowns above the
+        diagonal."""
+        d = dissection
+        panels: list[Array] = []
+        for m, rows in zip(np.diff(d.bounds).tolist(), d.rows, strict=True):
+            panels.append(np.zeros((m + len(rows), m)))
+        first = d.position[groups.members[groups.begin[:-1]]]
+        front = np.searchsorted(d.bounds, first, side="right") - 1
+        within = numbers % CELL
+        cost = 0.0
+        for g, h, slot in self._pairs(groups):
+            block = self._blocks[slot][np.ix_(within[groups.of(g)], within[groups.of(h)])]
+            if first[g] < first[h]:
+                g, h, block = h, g, block.T
+            t = int(front[h])
+            row, column = int(d.local(t, first[g])), int(first[h] - d.bounds[t])
+            panels[t][row : row + len(block), column : column + block.shape[1]] = block
+            cost += LOOKED_UP
+            if cost > 1e8:
+                yield cost
+                cost = 0.0
+        heavy = np.empty(len(numbers))
+        heavy[d.position] = weight
+        for t, panel in enumerate(panels):
+            i = np.arange(panel.shape[1])
+            panel[i, i] += heavy[d.bounds[t] : d.bounds[t + 1]]
+        yield cost
+        return panels
 
     def drop(self, numbers: IntArray) -> None:
         """Forget unknowns and what was known of others by them."""
-        n = len(self)
-        stay = np.setdiff1d(np.arange(n), self._places(numbers))
-        for i, row in enumerate(stay.tolist()):
-            self._lower[_begin(i) : _begin(i + 1)] = self._lower[_begin(row) + stay[: i + 1]]
-        self._lower[_begin(len(stay)) : _begin(n)] = 0.0
-        self._rhs[: len(stay)] = self._rhs[stay]
-        self._rhs[len(stay) : n] = 0.0
-        self.numbers = self.numbers[stay]
-        self._order = np.argsort(self.numbers)
+        cells, of = np.unique(numbers // CELL, return_inverse=True)
+        within = {cell: numbers[of == i] % CELL for i, cell in enumerate(cells.tolist()) if cell in self._row}
+        for cell, own in within.items():
+            self._rhs[self._row[cell], own] = 0.0
+            self._known[self._row[cell], own] = False
+        gone = {cell for cell in within if not self._known[self._row[cell]].any()}
+        for pair, slot in list(self._slot.items()):
+            later, earlier = pair
+            if later in gone or earlier in gone:
+                self._blocks[slot] = 0.0
+                self._free_slots.append(slot)
+                del self._slot[pair]
+                continue
+            if later in within:
+                self._blocks[slot][within[later]] = 0.0
+            if earlier in within:
+                self._blocks[slot][:, within[earlier]] = 0.0
+        for cell in gone:
+            self._free_rows.append(self._row.pop(cell))
 
 
-Places = TypeVar("Places", int, IntArray)
-
-
-def _begin(row: Places) -> Places:
-    """Where a row of the lower triangle begins."""
-    return row * (row + 1) // 2
+def _larger(array: Array) -> Array:
+    """The same with more room."""
+    found = np.zeros((int(GROWTH * len(array)) + 1, *array.shape[1:]), dtype=array.dtype)
+    found[: len(array)] = array
+    return found

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
-from ..arrays import IntArray
+from ..arrays import Bools, IntArray
 
 #: Unknowns of a part that is cut no more. Tuned: smaller parts save work, and cost calls.
 PART = 160
@@ -56,6 +56,11 @@ class Dissection:
         own = np.diff(self.bounds)
         return int(sum(int(m) * (int(m) + len(r)) for m, r in zip(own, self.rows, strict=True)))
 
+    def local(self, t: int, place: IntArray) -> IntArray:
+        """Rows (k,) of a front that places (k,) stand in: its own unknowns come first, then those of later fronts."""
+        first, end = self.bounds[t], self.bounds[t + 1]
+        return np.where(place < end, place - first, np.searchsorted(self.rows[t], place) + (end - first))
+
 
 @dataclass
 class _Node:
@@ -63,22 +68,33 @@ class _Node:
     children: list[_Node]
 
 
-def dissect(graph: csr_array, size: IntArray) -> list[tuple[IntArray, int]]:
+def dissect(
+    graph: csr_array, size: IntArray, last: Bools | None = None, most: int | None = None
+) -> list[tuple[IntArray, int]]:
     """Fronts of a graph in the order of elimination: groups of each, and the place of the front it hangs on (-1: none).
 
     Parameters
     ----------
     graph : (g, g) which groups of unknowns meet
     size : (g,) unknowns of each group
+    last : (g,) whether a group is in the last front, which all others hang on
+    most : unknowns of a front, at most, but for the last one and single groups; larger ones become a chain of them
     """
+    if not len(size):
+        return []
     degree = np.diff(graph.indptr)
     hub = degree > HUB * max(float(np.median(degree)), 1.0)
     if size[hub].sum() > size.sum() // 4:
         hub[:] = False
-    rest, last = np.flatnonzero(~hub), np.flatnonzero(hub)
-    nodes = _cut(graph, rest, size)
-    if len(last):
-        nodes = [_Node(last, nodes)]
+    kept = np.zeros(len(size), dtype=bool) if last is None else last
+    border = np.flatnonzero(hub & ~kept)
+    nodes = _cut(graph, np.flatnonzero(~hub & ~kept), size)
+    if len(border):
+        nodes = [_Node(border, nodes)]
+    if most is not None:
+        nodes = [_chained(node, size, most) for node in nodes]
+    if kept.any():
+        nodes = [_Node(np.flatnonzero(kept), nodes)]
     out: list[tuple[IntArray, int]] = []
 
     def number(node: _Node) -> int:
@@ -92,6 +108,16 @@ def dissect(graph: csr_array, size: IntArray) -> list[tuple[IntArray, int]]:
     for node in nodes:
         number(node)
     return out
+
+
+def _chained(node: _Node, size: IntArray, most: int) -> _Node:
+    """The same with fronts of so many unknowns at most."""
+    below = [_chained(child, size, most) for child in node.children]
+    part = (np.cumsum(size[node.groups]) - 1) // most
+    found = _Node(node.groups[part == part[0]], below) if len(part) else _Node(node.groups, below)
+    for i in np.unique(part)[1:].tolist():
+        found = _Node(node.groups[part == i], [found])
+    return found
 
 
 def _cut(graph: csr_array, groups: IntArray, size: IntArray) -> list[_Node]:
@@ -145,9 +171,14 @@ def _levels(graph: csr_array) -> IntArray:
     return level
 
 
-def find_fronts(graph: csr_array, group: IntArray, size: IntArray) -> Dissection:
-    """Order and fronts of unknowns, given the group (n,) of each."""
-    fronts = dissect(graph, size)
+def find_fronts(
+    graph: csr_array, group: IntArray, size: IntArray, last: Bools | None = None, most: int | None = None
+) -> Dissection:
+    """Order and fronts of unknowns, given the group (n,) of each; see `dissect`.
+
+    Unknowns of a group keep their order, one after the other.
+    """
+    fronts = dissect(graph, size, last, most)
     place = np.empty(len(size), dtype=np.int64)  # of a group in the order
     ordered = np.concatenate([own for own, _ in fronts])
     place[ordered] = np.arange(len(ordered))

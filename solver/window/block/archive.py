@@ -2,7 +2,7 @@
 
 The window lets go of unknowns by marginalisation, one strip at a time. So that a later strip can still tell an earlier
 one something, the information of every batch that became final is kept here a second time, before marginalisation: the
-normal equations of all strips, dense, and for every object point its coordinates as a function of the unknowns that its
+normal equations of all strips, and for every object point its coordinates as a function of the unknowns that its
 rays touched (`LeftPoints`). A point that is seen again in a later strip thus ties both, and its earlier looks are never
 counted twice. Drifts of tie points are unknowns as well, held at zero until they are named (`datum.drifts`). A solution
 of the whole gives every line and every point the information of the block: it is the backward pass for several strips.
@@ -16,10 +16,10 @@ from zlib import crc32
 
 import numpy as np
 
-from ...adjustment.dense_in_parts import Cost, Parts
 from ...adjustment.drift_hypotheses import EACH
 from ...adjustment.eliminated_points import eliminated
 from ...adjustment.growing_normals import BlockNormals
+from ...adjustment.in_parts import Cost, Parts
 from ...adjustment.normal_equations import whiten_prior
 from ...arrays import Array, IntArray
 from ...models.base import PseudoObservations
@@ -28,22 +28,26 @@ from ..results import TAKEN_BACK, AdjustedPoint, Look, Refusal, Update, WholeStr
 from ..state.batch import Batch
 from ..state.points import ControlPoint
 from ..state.strip import StatedConstants, WindowStrip
-from .backward import BlockSolution, LeftOrientation, LeftPoints
+from .backward import LeftOrientation, LeftPoints
 from .points import KeptPoint, SingleLook, rows_of
+from .solution import BlockSolution
 
-#: Unknowns of the strips kept together; beyond that the oldest strip is refined no more. The solution is dense: about
-#: two seconds of one core; with the equations it takes 210 MB, which are kept.
-BLOCK_UNKNOWNS = 4200
-#: Unknowns of one strip, at most, for it to be part of a block. Two of them are still solved together when the second
-#: is over, which is the work of a turn of a minute; then the first one is closed. Tuned.
-MOST_OF_STRIP = 2800
+#: Unknowns of the strips kept together, about fifty minutes of strips; beyond that the oldest strip is refined no more.
+#: Equations and factor take 0.6 GB then. Tuned: a solution is the work of a turn of a minute.
+BLOCK_UNKNOWNS = 20000
+#: Unknowns of one strip, at most, for it to be part of a block: about forty minutes. Two of them are still solved
+#: together when the second is over; then the first one is closed. Tuned.
+MOST_OF_STRIP = 16000
+#: Unknowns that a strip which is closed may have met, at most: what it says of them is a full matrix, in all solutions
+#: from then on. One that has met more leaves nothing. Tuned: that of 200 MB.
+MOST_MET = 5000
 #: A-priori equations of a strip that are added to those of the block at a time: all unknowns of a long strip as one
 #: dense matrix would be 60 MB, several times over.
 PRIOR_TOGETHER = 120
 #: Cost of refining a second or so of orientation, and the points of a batch, in floating point operations, about.
 REFINED_ORIENTATION, REFINED_POINTS = 4e7, 8e6
-#: Object points kept, beyond which the oldest strip is refined no more, and single looks kept beside them, which are
-#: thinned out beyond that. They bound the memory: a single look takes 20 kB. Tuned.
+#: Object points kept, and single looks beside them, which are thinned out beyond that; all control is kept. They bound
+#: the memory: a single look takes 20 kB. Tuned.
 MOST_POINTS, MOST_SINGLE = 30000, 6000
 #: Condition number of its normal matrix up to which a point counts as placed; rounding spoils what is beyond.
 PLACED = 1e12
@@ -90,6 +94,8 @@ class Archive:
         self.unplaced: set[str] = set()
         self._shared = shared_columns
         self._normals = BlockNormals()
+        n = len(shared_columns)
+        self._shared_known = np.zeros((n, n)), np.zeros(n)  # beforehand
         self.add(shared_columns, np.diag(shared_sigma**-2.0), np.zeros(len(shared_columns)))
         self.changed = False
 
@@ -113,6 +119,10 @@ class Archive:
         if self.holds(columns):
             self.changed = True
             self._normals.add(columns, matrix, rhs)
+            if np.isin(columns, self._shared).all():
+                at = np.nonzero(columns[:, None] == self._shared)[1]
+                self._shared_known[0][np.ix_(at, at)] += matrix
+                self._shared_known[1][at] += rhs
 
     def end_strip(self, strip: WindowStrip) -> None:
         """Nothing of a strip is left in the window: its unknowns, with their a-priori equations, are all known."""
@@ -207,22 +217,29 @@ class Archive:
                 self.points[name] = replace(kept, left=left, unplaced=False)
         self.unplaced.clear()
 
-    def linearise_single(self, solution: BlockSolution) -> Parts:
-        """Linearise single looks at a solution, so that the ties to them in the window are as good as it; in parts.
+    def thin_out(self) -> int:
+        """Forget some of too many points and single looks; returns how many points that were published.
 
-        Of too many some are forgotten, evenly over the flight, so that those of each strip are left to strips that
-        cross it later: batch by batch, which looks share, and of all that ever came the same share, by a number that a
-        batch has once and for all.
+        They go evenly over the flight, so that those of each strip are left to strips that cross it later: batch by
+        batch, which looks share, and of all that ever came the same share, by a number that a batch has once and for
+        all. What points that are forgotten said of the orientation stays.
         """
-        names = [name for name, kept in self.points.items() if kept.single is not None]
-        for name in sorted(names, key=self._turn)[MOST_SINGLE:]:
+        single = [name for name, kept in self.points.items() if kept.single is not None]
+        placed = [name for name, kept in self.points.items() if kept.single is None]
+        gone = sorted(placed, key=self._turn)[MOST_POINTS:] if len(placed) > MOST_POINTS else []
+        gone = [name for name in gone if not self.points[name].control.any()]
+        for name in gone + sorted(single, key=self._turn)[MOST_SINGLE:]:
             del self.points[name]
+        return len(gone)
+
+    def linearise_single(self, solution: BlockSolution) -> Parts:
+        """Linearise single looks at a solution, so that the ties to them in the window are as good as it; in parts."""
         done: set[int] = set()
         for kept in self.points.values():
             if kept.single is not None:
                 batch = kept.single.batch
                 if id(batch) not in done:
-                    theta, _ = solution.of(batch.columns)
+                    theta = solution.values_of(batch.columns)
                     batch.back_substitute(theta)
                     batch.linearise(theta, reweigh=True)
                     done.add(id(batch))
@@ -230,10 +247,10 @@ class Archive:
                 kept.left = kept.single.left() or kept.left
 
     def _turn(self, name: str) -> int:
-        """Single looks are forgotten from the highest number on."""
-        single = self.points[name].single
-        assert single is not None
-        return crc32(single.batch.names[0].encode())
+        """Points are forgotten from the highest number on."""
+        kept = self.points[name]
+        first = kept.left.points[0].name if kept.single is None else kept.single.batch.names[0]
+        return crc32(first.encode())
 
     def _keep(self, name: str, kept: KeptPoint) -> None:
         """Put a point in place of what is known of it, as the newest."""
@@ -325,7 +342,7 @@ class Archive:
     # -- solution ------------------------------------------------------------------------------------------------------
 
     def solving(self, named: Iterable[Named] = ()) -> Generator[Cost, None, BlockSolution]:
-        """Values and cofactors of all unknowns from all that is kept. The next solution takes its place in memory.
+        """Values and cofactors of all unknowns from all that is kept.
 
         In parts, each with what it costs; nothing may become final meanwhile.
 
@@ -335,8 +352,8 @@ class Archive:
         """
         self.changed = False
         numbers, weight = self._unknowns(self.strips.values(), named, self._shared)
-        values, cofactors = yield from self._normals.solving(numbers, weight)
-        return BlockSolution(numbers, values, cofactors)
+        values, factor = yield from self._normals.solving(numbers, weight)
+        return BlockSolution(numbers, values, factor)
 
     def _unknowns(
         self, strips: Collection[KeptStrip], named: Iterable[Named], others: IntArray | tuple[()] = ()
@@ -371,25 +388,31 @@ class Archive:
     def beyond(self) -> list[str]:
         """The strips that must be closed so that the block keeps its bounds, oldest first."""
         left, found = list(self.strips), []
-        while len(left) > 1:
-            unknowns = len(self._shared) + sum(len(self.strips[id].entered) for id in left)
-            points = sum(p.single is None and p.strips.isdisjoint(found) for p in self.points.values())
-            if unknowns <= BLOCK_UNKNOWNS and points <= MOST_POINTS:
-                break
+        unknowns = {id: len(strip.entered) for id, strip in self.strips.items()}
+        while len(left) > 1 and len(self._shared) + sum(unknowns[id] for id in left) > BLOCK_UNKNOWNS:
             found.append(left.pop(0))
         return found
 
-    def drop(self, id: str) -> None:
-        """Forget a strip as if it had never been tied to others."""
-        self._normals.drop(self._forget(id).numbers)
+    def is_closable(self, ids: Collection[str], named: Iterable[Named] = ()) -> bool:
+        """Whether what strips say of the others can be kept; see `MOST_MET`."""
+        strips = [self.strips[id] for id in ids]
+        return len(self._normals.met(self._unknowns(strips, named)[0])) <= MOST_MET
 
-    def closing(self, id: str, named: Iterable[Named] = ()) -> Parts:
-        """Eliminate a strip's unknowns, also the drifts in it that are named: the others keep their solution.
+    def closing(self, ids: Collection[str], named: Iterable[Named] = ()) -> Parts:
+        """Eliminate the unknowns of strips, also the drifts in them that are named: the others keep their solution.
 
-        In parts, each with what it costs. The memory of the last solution is used.
+        In parts, each with what it costs.
         """
-        yield from self._normals.close(*self._unknowns([self.strips[id]], named))
-        self._forget(id)
+        yield from self._normals.close(*self._unknowns([self.strips[id] for id in ids], named))
+        for id in ids:
+            self._forget(id)
+
+    def begin_again(self) -> None:
+        """Forget all strips, and what they say of the unknowns that all share: one that is being flown is too long."""
+        self.strips, self.points = {}, {}
+        self.unplaced.clear()
+        self._normals = BlockNormals()
+        self._normals.add(self._shared, *self._shared_known)
 
     def _forget(self, id: str) -> KeptStrip:
         """A strip, its points and its drifts are kept no more; returns it."""

@@ -7,73 +7,26 @@ It is the smoother that belongs to the window's filter, and agrees with a batch 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
 from ...adjustment.eliminated_points import EliminatedPoints
 from ...adjustment.reliability import CRITICAL_W
-from ...arrays import Array, IntArray
+from ...arrays import Array
 from ...geometry.rotation import corrected_angles
 from ...models.base import Design
 from ..results import AdjustedPoint, RefinedOrientation, WholeStrips
 from ..state.batch import Batch, inverse_factors
-from ..state.strip import TIMES_AT_ONCE
 from ..state.unknowns import Marginal, WindowState
+from .solution import DenseSolution, Solution
 
+#: Times of orientation that are refined at once: so few that observations have their unknowns in common. Tuned.
+REFINED_AT_ONCE = 16
 #: Factor by which a variance must exceed an earlier one to count as larger, above the rounding of either. Tuned.
 LARGER = 1.01
-
-
-@dataclass(frozen=True)
-class BlockSolution:
-    """Values (n,) and cofactors (n, n) of the unknowns ``numbers`` (n,), which ascend.
-
-    Drifts of tie points (`datum.drifts.of_block`) have negative numbers; those that are not among the unknowns are zero
-    and certain.
-    """
-
-    numbers: IntArray
-    values: Array
-    cofactors: Array
-
-    def places(self, numbers: IntArray) -> IntArray:
-        """Places of unknowns that are in the solution."""
-        return np.searchsorted(self.numbers, numbers)
-
-    def of(self, numbers: IntArray) -> tuple[Array, Array]:
-        """Values (m,) and cofactors (m, m) of some unknowns, drifts among them."""
-        known = numbers >= 0
-        if not known.all():
-            known |= np.isin(numbers, self.numbers)
-        at = self.places(numbers[known])
-        values, Q = self.values[at], np.empty((len(at), len(at)))
-        for here, there in _runs(at):
-            self.cofactors[there].take(at, axis=1, out=Q[here], mode="clip")
-        if known.all():
-            return values, Q
-        all_values, all_Q = np.zeros(len(numbers)), np.zeros((len(numbers), len(numbers)))
-        all_values[known], all_Q[np.ix_(known, known)] = values, Q
-        return all_values, all_Q
-
-    def through(self, functions: Array, places: IntArray) -> Array:
-        """Cofactors (k, n) between functions (k, m) of unknowns at places (m,) and all unknowns."""
-        found = np.zeros((len(functions), len(self.numbers)))
-        for here, there in _runs(places):
-            found += functions[:, here] @ self.cofactors[there]
-        return found
-
-
-def _runs(places: IntArray) -> Iterator[tuple[slice, slice]]:
-    """Stretches of places (m,) that follow each other, among these and as places: unknowns stand together in a large
-    matrix, so that it need not be copied row by row."""
-    ends = [0, *(np.flatnonzero(np.diff(places) != 1) + 1).tolist(), len(places)]
-    for begin, end in pairwise(ends if len(places) else ()):
-        first = int(places[begin])
-        yield slice(begin, end), slice(first, first + end - begin)
 
 
 @dataclass(frozen=True)
@@ -91,7 +44,7 @@ class LeftPoints:
         functions = EliminatedPoints(batch.columns, batch.origin_l[full], factor, y, batch.coupling[full])
         return cls(functions, tuple(published))
 
-    def refined(self, solution: BlockSolution) -> list[AdjustedPoint]:
+    def refined(self, solution: Solution) -> list[AdjustedPoint]:
         """The points as a solution of whole strips gives them."""
         xyz_l, covariance = self.functions.at(*solution.of(self.functions.columns))
         return [
@@ -115,11 +68,11 @@ class LeftOrientation:
     design: Design
     noise: Array
 
-    def refined(self, solution: BlockSolution) -> RefinedOrientation:
+    def refined(self, solution: Solution) -> RefinedOrientation:
         """The orientation as a solution of whole strips gives it."""
         old, n = self.published, len(self.published.time_s)
         change, covariance = -old.correction, self.noise.copy()
-        for part in (slice(i, i + TIMES_AT_ONCE) for i in range(0, n, TIMES_AT_ONCE)):
+        for part in (slice(i, i + REFINED_AT_ONCE) for i in range(0, n, REFINED_AT_ONCE)):
             columns, A = self.design.part(part).functions()
             theta, Q = solution.of(columns)
             change[part] += A @ theta
@@ -153,7 +106,7 @@ class Step:
     left: list[LeftPoints] = field(default_factory=list)
 
 
-def before(left: Marginal, later: BlockSolution) -> BlockSolution:
+def before(left: Marginal, later: DenseSolution) -> DenseSolution:
     """The solution for unknowns that left at one time and those that stayed then, from one for the latter.
 
     The cofactors of those that stayed are made symmetric: what rounding leaves of asymmetry would come back with
@@ -168,7 +121,7 @@ def before(left: Marginal, later: BlockSolution) -> BlockSolution:
     Q = np.block([[own @ own.T - Q12 @ T.T, Q12], [Q12.T, Q22]])
     numbers, values = np.concatenate([left.gone, left.stayed]), np.concatenate([x1, x2])
     order = np.argsort(numbers)
-    return BlockSolution(numbers[order], values[order], Q[np.ix_(order, order)])
+    return DenseSolution(numbers[order], values[order], Q[np.ix_(order, order)])
 
 
 def backward(steps: list[Step], state: WindowState) -> WholeStrips:
@@ -176,7 +129,7 @@ def backward(steps: list[Step], state: WindowState) -> WholeStrips:
     found = WholeStrips([], [])
     stayed = np.sort(steps[-1].marginal.stayed)
     cofactors = state.covariance(stayed) if len(stayed) else np.empty((0, 0))
-    solution = BlockSolution(stayed, state.values(stayed), cofactors)
+    solution = DenseSolution(stayed, state.values(stayed), cofactors)
     for step in reversed(steps):
         solution = before(step.marginal, solution)
         if step.orientation is not None:

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from ...adjustment.dense_in_parts import Parts
+from ...adjustment.in_parts import Parts
 from ...arrays import Array
 from ..datum.biases import Coordinate
 from ..datum.drifts import Cell, Named
@@ -23,7 +23,8 @@ from ..state.network import LiveNetwork
 from ..state.points import ControlPoint
 from ..state.strip import WindowStrip
 from .archive import BLOCK_UNKNOWNS, MOST_OF_STRIP, MOST_POINTS, Archive, KeptStrip
-from .backward import BlockSolution, LeftOrientation, LeftPoints, Step, backward
+from .backward import LeftOrientation, LeftPoints, Step, backward
+from .solution import BlockSolution
 from .ties import EarlierStrips
 
 #: Floating point operations of the work on the block for each second of platform time: about a tenth of a core. Tuned.
@@ -57,6 +58,7 @@ class Block:
         self._solved: tuple[BlockSolution, frozenset[str]] | None = None  # the last solution, and the strips in it
         self._full = 0
         self._work: Parts | None = None
+        self._ahead: Parts | None = None  # what need not be done before others go on
         self._worked_s = -np.inf
         self._orientation: dict[tuple[str, float], RefinedOrientation] = {}
         self._points: dict[str, AdjustedPoint] = {}
@@ -97,10 +99,9 @@ class Block:
         at once where nothing else does."""
         self.conclude()
         self._archive.place_single(height_m)
-        if self._solved is not None and not self.earlier.points and not self.earlier.present:
+        if self._solved is not None and not len(self.earlier) and not self.earlier.present:
             solution, strips = self._solved
-            for _ in self.earlier.learning(self._archive, solution, set(self._archive.strips) - strips):
-                pass
+            self.earlier.learn(self._archive, solution, set(self._archive.strips) - strips)
 
     def orientation(self, strip: WindowStrip, final: LeftOrientation) -> None:
         """Orientation that became final."""
@@ -109,9 +110,9 @@ class Block:
             return
         kept.orientation.append(final)
         if len(strip.entered) > MOST_OF_STRIP:
-            self._archive.drop(strip.id)
+            self._archive.begin_again()
             self.events.append(
-                f"strip {strip.id} has more than {MOST_OF_STRIP} unknowns: it is refined alone, and ties no others"
+                f"strip {strip.id} has more than {MOST_OF_STRIP} unknowns: it is refined alone, those before it no more"
             )
 
     def gone(self, strip: WindowStrip) -> None:
@@ -176,8 +177,10 @@ class Block:
         if self._work is None and self.quiet and (self._new or self._archive.changed or at_the_end):
             self._begin_work(steps, at_the_end)
             self._worked_s = now_s - FIRST_PORTION_S
-        if self._work is not None:
-            self._advance(np.inf if at_the_end else RATE * (now_s - self._worked_s))
+        if self._work is not None or self._ahead is not None:
+            left = self._advance(np.inf if at_the_end else RATE * (now_s - self._worked_s))
+            if self.quiet and not at_the_end:
+                self._prepare(left)
             self._worked_s = now_s
         return self._told(*(None, None) if at_the_end else (MOST_TOLD, MOST_POINTS_TOLD))
 
@@ -192,12 +195,24 @@ class Block:
         """Do what is left of the work: what comes now builds on it, or changes the equations that it reads."""
         self._advance(np.inf)
 
-    def _advance(self, portion: float) -> None:
+    def _advance(self, portion: float) -> float:
+        """Do a portion of the work; returns what is left of the portion when the work is done."""
         for cost in self._work or ():
             portion -= cost
             if portion <= 0.0:
-                return
+                return 0.0
         self._work = None
+        return portion
+
+    def _prepare(self, portion: float) -> None:
+        """Do a portion of what the next strip may want to know of earlier ones."""
+        if portion <= 0.0:
+            return
+        for cost in self._ahead or ():
+            portion -= cost
+            if portion <= 0.0:
+                return
+        self._ahead = None
 
     def _restate_shared(self) -> None:
         """Have sigmas of unknowns that all strips share count as they have been restated."""
@@ -230,19 +245,33 @@ class Block:
         """Solve the block, refine strips, close the oldest if there are too many, prepare ties to them; in parts."""
         named = self.drifts
         strips = frozenset(self._archive.over)
+        self._solved = self._ahead = None  # their memory is used again
+        self.earlier.forget()
         solution = yield from self._archive.solving(named)
         self._solved = solution, strips
         closing = self._archive.beyond()
         for ids in (wanted, *([id] for id in closing)):
             self._tell((yield from self._archive.refining(solution, ids)))
+        solution.factor.forget_selected()
         if not at_the_end:
+            if gone := self._archive.thin_out():
+                self.events.append(
+                    f"the block has over {MOST_POINTS} points: {gone} tie no later strip, and stay as they are"
+                )
             yield from self._archive.linearise_single(solution)
-            yield from self.earlier.learning(self._archive, solution, closing)
+            self.earlier.learn(self._archive, solution, closing)
+            self._ahead = self.earlier.preparing()
         for id in closing:
-            yield from self._archive.closing(id, named)
-            self.events.append(
-                f"strip {id} is refined no more: the block has over {BLOCK_UNKNOWNS} unknowns or {MOST_POINTS} points"
-            )
+            if id not in self._archive.strips:  # closed with the one before it
+                continue
+            too_many = f"the block has over {BLOCK_UNKNOWNS} unknowns"
+            if self._archive.is_closable([id], named):
+                yield from self._archive.closing([id], named)
+                self.events.append(f"strip {id} is refined no more: {too_many}")
+            else:
+                every = self._archive.over
+                yield from self._archive.closing(every, named)
+                self.events.append(f"strips {', '.join(every)} are refined no more: {too_many}; another one begins")
 
     def _tell(self, refined: WholeStrips) -> None:
         """Have something published: once, as it was refined last."""

@@ -93,8 +93,8 @@ class Arrivals:
 
     def _share(self, name: str) -> tuple[int, bool]:
         """Which points go into a batch together: those of a time, and those that tie strips apart."""
-        point, earlier = self._network.intake.points[name], self._block.earlier.points.get(name)
-        point.spent = earlier is not None and earlier.with_control and not point.alone
+        point = self._network.intake.points[name]
+        point.spent = self._block.earlier.has_control(name) and not point.alone
         tied = not point.alone and self._block.earlier.enter(name, max(point.time_s))
         return int(min(point.time_s) // self._step_s), tied
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from triline.solver.window.block.backward import BlockSolution, before
+from triline.solver.window.block.backward import before
+from triline.solver.window.block.solution import DenseSolution
 from triline.solver.window.state.unknowns import Marginal
 
 #: Unknowns of a strip that follow each other, those in the window, and those that leave together.
@@ -50,7 +51,7 @@ def test_cofactors_of_a_long_strip_are_those_of_all_unknowns_at_once():
         steps.append(Marginal(gone, stayed, R11, R12, d1))
     left = np.concatenate([np.arange(COUNT - WINDOW, COUNT), constants])
     cofactors = np.linalg.inv(A[np.ix_(left, left)])
-    solution = BlockSolution(left, cofactors @ b[left], cofactors)
+    solution = DenseSolution(left, cofactors @ b[left], cofactors)
     Q = np.linalg.inv(N)
     for step in reversed(steps):
         solution = before(step, solution)

@@ -9,9 +9,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from triline.solver.adjustment.dense_in_parts import in_one_go
 from triline.solver.adjustment.drift_hypotheses import ALL, EACH, Hypothesis, Scores, Suspicion, hypotheses
 from triline.solver.adjustment.eliminated_points import eliminated
+from triline.solver.adjustment.in_parts import in_one_go
 from triline.solver.camera.line_camera import finest_pixel
 from triline.solver.camera.self_calibration import tls
 from triline.solver.simulation.camera_errors import simulate_with_camera_errors

@@ -392,7 +392,7 @@ def test_what_is_kept_of_a_long_flight_is_even(monkeypatch):
     the last one all."""
     monkeypatch.setattr(archive, "MOST_SINGLE", 600)
     block = archive.Archive(np.empty(0, dtype=np.int64), np.empty(0))
-    solution = SimpleNamespace(of=lambda columns: (None, None))
+    solution = SimpleNamespace(values_of=lambda columns: None)
     for second in range(0, 1200, 4):
         names = tuple(f"S{second // 60}-M{10 * second + i}" for i in range(10))
         batch = SimpleNamespace(
@@ -412,7 +412,8 @@ def test_no_more_than_so_many_are_kept(flight, monkeypatch):
     told = []
 
     def watch(now, window):
-        told.append(sum(point.single for point in window._block.earlier.points.values()))
+        patches = window._block.earlier._patches
+        told.append(sum(kept.single is not None for patch in patches for kept in patch.members.values()))
 
     adjust_online(*flight, OPTIONS, live=False, update_s=0.5, watch=watch)
     assert max(told) == 3

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from three_strips import OPTIONS, PLAN, SENSORS, SIDE_BY_SIDE, TIES, flown, usual, usual_at_once, usual_online
 
-from triline.solver.adjustment.dense_in_parts import in_one_go
+from triline.solver.adjustment.in_parts import in_one_go
+from triline.solver.camera.self_calibration import focal_length
 from triline.solver.simulation.scenario import simulate
 from triline.solver.simulation.window_study import (
     adjust_at_once,
@@ -231,8 +232,8 @@ def test_a_strip_that_is_closed_leaves_what_it_says_of_the_others(online):
     archive = deepcopy(online.window._block._archive)
     stay = np.concatenate([archive.strips[id].entered for id in ("S2", "C1")])
     values, Q = in_one_go(archive.solving()).of(stay)
-    in_one_go(archive.closing("S1"))
-    rest = in_one_go(archive.solving())  # in the place of the one before
+    in_one_go(archive.closing(["S1"]))
+    rest = in_one_go(archive.solving())
     assert len(rest.numbers) == len(stay)
     again, Q_again = rest.of(stay)
     sigma = np.sqrt(np.diag(Q))
@@ -246,6 +247,47 @@ def test_a_block_keeps_its_bounds_and_says_so(flight, bounded):
     assert {o.strip for o in result.whole} == {"S1", "S2", "C1"}
     assert list(result.window._block._archive.strips) == ["C1"]
     assert 0.3 < orientation_errors(flight[0], result.whole).nees.mean() < 2.0
+
+
+def test_where_one_strip_cannot_leave_what_it_says_all_are_closed_and_the_camera_is_kept():
+    simulation, poses = flown(SIDE_BY_SIDE)
+    camera = focal_length(simulation.flight.camera)
+    archive = adjust_online(simulation, poses, OPTIONS, camera, live=False, update_s=0.5).window._block._archive
+    values, Q = in_one_go(archive.solving()).of(archive._shared)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(window_archive, "MOST_MET", 10)
+        assert not archive.is_closable(["S1"])
+        patch.setattr(window_archive, "BLOCK_UNKNOWNS", 50)
+        patch.setattr(window_archive, "MOST_POINTS", 20)
+        patch.setattr(window_block, "MOST_POINTS", 20)
+        result = adjust_online(simulation, poses, OPTIONS, camera, live=False, update_s=0.5)
+    told = " | ".join(result.events)
+    assert "the block has over 20 points" in told and "strips S1, S2 are refined no more" in told
+    again, Q_again = in_one_go(result.window._block._archive.solving()).of(archive._shared)
+    assert again == pytest.approx(values, abs=0.1 * np.sqrt(Q[0, 0])) and Q_again == pytest.approx(Q, rel=0.02)
+    for strip in ("S1", "S2"):  # with the points that are forgotten
+        errors = orientation_errors(simulation, [o for o in result.whole if o.strip == strip])
+        assert 0.3 < errors.nees.mean() < 2.0
+    assert len(result.whole_points) > 100
+
+
+def test_a_strip_too_long_for_a_block_leaves_those_before_it_as_they_are():
+    """Not as if all that is unknown of it were nothing, which what ties them would say otherwise."""
+    simulation, poses = flown(SIDE_BY_SIDE)
+    (_, end), _ = simulation.flight.strip_times_s
+    with pytest.MonkeyPatch.context() as patch:
+
+        def watch(now_s, _):
+            if now_s > end + 5.0:
+                patch.setattr(window_block, "MOST_OF_STRIP", 60)
+
+        result = adjust_online(simulation, poses, OPTIONS, live=False, update_s=0.5, watch=watch)
+    assert any("S2 has more than 60 unknowns" in text for text in result.events)
+    assert not result.window._block._archive.strips
+    assert {o.strip for o in result.whole} == {"S1", "S2"}
+    for strip in ("S1", "S2"):
+        errors = orientation_errors(simulation, [o for o in result.whole if o.strip == strip])
+        assert 0.2 < errors.nees.mean() < 2.0
 
 
 def test_strips_are_published_when_they_are_over_and_when_they_are_closed_no_more_often(bounded):
