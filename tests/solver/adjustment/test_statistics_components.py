@@ -1,6 +1,7 @@
 """Variance components, direct georeferencing, and how errors compare with the sigmas stated for them, over seeds."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -60,14 +61,21 @@ def test_group_redundancies_sum_up():
     assert sum(n for n, _, _ in sums.values()) == solution.n_observations
 
 
+@cache
+def without_camera(seed):
+    """A small network, and the global test of its adjustment without parameters of the camera; to be read only."""
+    network = block(seed, points=12).network
+    return network, run(network, Job(MODEL)).test
+
+
 @pytest.mark.parametrize("how", ["usual", "free", "stated"])
 def test_usual_sigmas_of_a_camera_are_no_observations(how):
     """A camera without errors leaves them no residuals: as observations they make sigma0 too small."""
     parameters = {"usual": tls(CAMERA), "free": tls(CAMERA).free(), "stated": tls(CAMERA).scaled(1.0)}[how]
     plain, with_camera = [], []
     for seed in range(20):
-        network = block(seed, points=12).network
-        plain.append(run(network, Job(MODEL)).test)
+        network, test = without_camera(seed)
+        plain.append(test)
         result = run(network, Job(MODEL, self_calibration=parameters, eliminate=False))
         with_camera.append(result.test)
         of_groups = sum(r for _, _, r in result.groups.values())
@@ -86,8 +94,8 @@ def test_what_is_known_of_the_trajectory_counts_once_in_two_models(stated):
     second = LimOptions(4, True, MODEL.offset_sigma_m, MODEL.shift_sigma_deg)
     one, two = [], []
     for seed in range(12):
-        network = block(seed, points=12).network
-        one.append(run(network, Job(MODEL)).test)
+        network, test = without_camera(seed)
+        one.append(test)
         result = run(network, Job(MODEL, second, then_stated=stated))
         two.append(result.test)
         measured = result.measured_redundancy
