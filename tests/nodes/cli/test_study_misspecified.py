@@ -105,7 +105,7 @@ def test_what_is_told_is_the_true_wander():
         return through_window(simulation, poses)
 
     for row in ("wander-time", "stated"):
-        fly("rtk", row, 1, strip_s=12.0, online=online, told=True)
+        fly("rtk", row, 1, strip_s=8.0, online=online, told=True)
     assert heard == [replace(SETTINGS["rtk"], wander_time_s=10.0), SETTINGS["rtk"]]
 
 
@@ -189,7 +189,7 @@ def test_a_boresight_is_not_taken_for_the_camera():
     assert online_quality(simulation, answer, np.zeros(3)).points_m < 0.2
 
 
-SHORT = ("study", "misspecified", "--seconds", "12", "--settings", "rtk", "--online", "window", "--jobs", "1", "--json")
+SHORT = ("study", "misspecified", "--seconds", "8", "--settings", "rtk", "--online", "window", "--jobs", "1", "--json")
 
 
 def figures_of(capsys, *words: str) -> tuple[dict, str]:
@@ -222,7 +222,7 @@ def test_flights_of_other_code_or_another_plan_are_not_taken(tmp_path, capsys, m
     kept = tmp_path / "flights.jsonl"
     words = ("--rows", "stated", "--seeds", "1", "--flights", str(kept))
     figures_of(capsys, *words)
-    _, err = figures_of(capsys, *words, "--seconds", "14")
+    _, err = figures_of(capsys, *words, "--seconds", "9")
     assert len(kept.read_text().splitlines()) == 2 and not err
     monkeypatch.setattr(study_misspecified, "code_digest", lambda: "0123456789ab")
     _, err = figures_of(capsys, *words)
