@@ -113,7 +113,7 @@ def test_a_window_that_lets_nothing_go_is_the_batch_adjustment(flight, model):
 def test_marginalisation_loses_nothing_and_invents_nothing(flight):
     simulation, poses = flight
     runs = [
-        adjust_online(simulation, poses, WindowOptions(window_s=w, snoop=False, settle_s=NEVER), update_s=0.5)
+        adjust_online(simulation, poses, WindowOptions(window_s=w, snoop=False, settle_s=NEVER), update_s=1.0)
         for w in (20.0, NEVER)
     ]
     short, long = ({round(float(o.time_s[0]), 3): o for o in run.live if o.time_s[0] > 25.0} for run in runs)
@@ -127,9 +127,9 @@ def test_marginalisation_loses_nothing_and_invents_nothing(flight):
 
 def test_the_backward_pass_gives_every_time_what_the_whole_strip_knows(flight):
     simulation, poses = flight
-    online = adjust_online(simulation, poses, WindowOptions(window_s=20.0, snoop=False), live=False, update_s=0.5)
+    online = adjust_online(simulation, poses, WindowOptions(window_s=20.0, snoop=False), live=False, update_s=1.0)
     batch = adjust_online(
-        simulation, poses, WindowOptions(window_s=NEVER, settle_s=NEVER, snoop=False), live=False, update_s=0.5
+        simulation, poses, WindowOptions(window_s=NEVER, settle_s=NEVER, snoop=False), live=False, update_s=1.0
     )  # the same, with nothing let go before the end
     joined = [
         [np.concatenate([getattr(o, name) for o in run]) for name in ("time_s", "correction", "covariance", "angles")]
@@ -184,7 +184,7 @@ def test_consistent_over_seeds_and_better_than_direct_georeferencing(seeds):
     for seed in range(seeds):
         simulation = simulate(PLAN, seed, SENSORS, TIES)
         poses = navigate(simulation)
-        result = adjust_online(simulation, poses, WindowOptions(grid_hz=4.0), update_s=0.5)
+        result = adjust_online(simulation, poses, WindowOptions(grid_hz=4.0), update_s=1.0)
         ratio["live"].append(orientation_errors(simulation, result.live).nees.mean())
         final = orientation_errors(simulation, result.final)
         ratio["final"].append(final.nees.mean())
@@ -235,8 +235,8 @@ def test_outliers_are_found_and_the_result_is_as_good_as_without_them(seeds):
         simulation = simulate(PLAN, seed, SENSORS, replace(plan, outlier_share=0.2))
         poses = navigate(simulation)
         without = replace(simulation, images=simulation.images.select(~simulation.images.outlier))
-        good = adjust_online(without, poses, live=False, update_s=0.5)
-        result = adjust_online(simulation, poses, live=False, update_s=0.5)
+        good = adjust_online(without, poses, live=False, update_s=1.0)
+        result = adjust_online(simulation, poses, live=False, update_s=1.0)
         clean.append(orientation_errors(simulation, good.final).rmse)
         dirty.append(orientation_errors(simulation, result.final).rmse)
         common = [
