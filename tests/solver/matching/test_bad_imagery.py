@@ -114,6 +114,9 @@ def spoilt_pixels(images, kind):
     ],
 )
 def test_a_few_pixels_that_were_not_measured_cost_few_ties_and_no_honesty(flown, images, clean, fault):
+    if fault == "lost":  # what every run of the tests looks at: three quarters of the flight
+        images = [image[:1100] for image in images]
+        clean = [tie for tie in clean if max(ray.line for ray in tie.rays) < 1100]
     lost = lost_in_threes(images, 0.05)
     assert all(0.035 < mask.mean() < 0.065 for mask in lost)
     if fault == "lost":
