@@ -392,6 +392,6 @@ def test_a_point_without_the_drift_is_that_of_a_solution_with_the_drift_as_unkno
     values, Q = in_one_go(block.solving()).of(columns)  # where it is not named, it is zero and certain
     assert values[:4] == pytest.approx(np.linalg.solve(N[:7, :7], moment[:7])[:4])
     assert not values[4:].any() and not Q[4:].any() and not Q[:, 4:].any()
-    in_one_go(block.closing("S1", named))
+    in_one_go(block.closing(["S1"], named))
     rest = in_one_go(block.solving()).of(columns)
     assert rest[0][:4] == pytest.approx(together[:4]) and rest[1][:4, :4] == pytest.approx(covariance[:4, :4])
