@@ -30,9 +30,11 @@ SETTINGS = {
     "pixels": 500,
     "images": True,
     "height": 600.0,
-    "seconds": 20.0,
+    "speed": 120.0,
+    "seconds": 12.0,
     "lead_in": 2.0,
-    "attitude_rate": 100.0,
+    "check": 10,
+    "attitude_rate": 50.0,
     "seed": 6,
 }
 
@@ -48,7 +50,7 @@ def run(tmp_path, messages, points_per_s=4.0, **settings):
     flight, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
     write_recording(flight, messages)
     with RecordingWriter(out) as writer:
-        nodes = [Navigator(), Matcher(points_per_s=points_per_s, **settings), Adjuster()]
+        nodes = [Navigator(), Matcher(points_per_s=points_per_s, **settings), Adjuster(update_s=1.0, update_rays=100)]
         summary = process(RecordingReader(flight), nodes, writer.write_raw)
     reader = RecordingReader(out)
     ties = [m.body for m in reader.messages(["observation/tie"]) if "-M" in m.body.point]
@@ -133,12 +135,12 @@ FAULTS = {
     "a CCD line falls silent": (
         backward_dies,
         {"ties": 60},
-        ("B: nothing has come after line 149",),
+        ("B: nothing has come after line 151",),
     ),
     "the nadir line dies": (
         nadir_dies,
         {"ties": 60},
-        ("N: nothing has come after line 149", "N sees nothing: tie points begin in B"),
+        ("N: nothing has come after line 151", "N sees nothing: tie points begin in B"),
     ),
     "lens cap, then water": (
         chain(lines_between(40, 100, 0), lines_between(235, 400, water)),
@@ -164,7 +166,7 @@ def test_bad_imagery_is_told_in_a_line_and_counted_and_the_adjustment_goes_on(tm
     assert all("\n" not in text for text in told)
     assert sum(": target " not in text for text in told) < 20 and not any("no lines" in text for text in told)
     assert len(ties) > 10 and counted["ties"] == len(ties)
-    assert summary.outputs["orientation/final"] > 300
+    assert summary.outputs["orientation/final"] > 180
 
 
 @pytest.mark.study
@@ -229,10 +231,31 @@ def test_what_the_adjuster_answers_is_no_progress():
     assert told == ["trajectory/filtered", "sensor/lines/N"]
 
 
+@pytest.fixture(scope="module")
+def short():
+    flight = simulated_flight({**SETTINGS, "seconds": 8.0})
+    return list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
+
+
+def whole_orientation(out):
+    """Perspective centres of the last answers."""
+    poses = [pose_sample(x.body) for x in RecordingReader(out).messages(["orientation/whole"])]
+    return np.array([pose.position_l for pose in poses])
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory, short):
+    """Ties of the flight as it is, and its whole orientation."""
+    folder = tmp_path_factory.mktemp("alone")
+    summary, ties, _ = run(folder, short)
+    assert not summary.counters["matcher"].get("malformed") and not summary.counters["adjuster"].get("malformed")
+    return ties, whole_orientation(folder / "out.mcap")
+
+
 # ---- two strips at once
 
 
-def test_lines_of_a_second_camera_leave_the_strip_that_began_first_as_it_is(tmp_path, short):
+def test_lines_of_a_second_camera_leave_the_strip_that_began_first_as_it_is(tmp_path, short, alone):
     """With each block of another strip matching began anew: no tie point, no target, and nothing said so."""
 
     def second():
@@ -246,15 +269,13 @@ def test_lines_of_a_second_camera_leave_the_strip_that_began_first_as_it_is(tmp_
         for x in blocks[1::2]:
             yield replace(x, body=replace(x.body, strip="T1"))
 
-    (tmp_path / "alone").mkdir()
-    _, alone, _ = run(tmp_path / "alone", short)
     numbers = Counter()
     both = sorted([*short, *second()], key=lambda x: x.stamp_ns)
     for k, x in enumerate(both):
         both[k] = replace(x, sequence=numbers[x.topic])
         numbers[x.topic] += 1
     summary, ties, told = run(tmp_path, both)
-    assert len(ties) > 0.8 * len(alone) > 20
+    assert len(ties) > 0.8 * len(alone[0]) > 20
     assert {image.strip for tie in ties for image in tie.images} == {"S1"}
     (said,) = [text for text in told if "beside" in text]
     assert said.startswith("T1: its lines come beside those of S1: they are left out")
@@ -279,12 +300,6 @@ def raised(messages, by_m, control=True):
                 body.origin_height -= by_m
             message = replace(message, body=body)
         yield message
-
-
-@pytest.fixture(scope="module")
-def short():
-    flight = simulated_flight({**SETTINGS, "seconds": 12.0})
-    return list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
 
 
 @pytest.mark.parametrize(
@@ -351,7 +366,7 @@ def test_control_that_does_not_count_tells_no_height_of_the_ground(short):
 @pytest.fixture(scope="module")
 def low():
     """Flown so low that all looks at a point are there after 6 s."""
-    flight = simulated_flight({**SETTINGS, "height": 300.0, "seconds": 18.0})
+    flight = simulated_flight({**SETTINGS, "height": 300.0, "seconds": 11.0})
     return list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
 
 
@@ -373,7 +388,7 @@ def test_a_matcher_that_begins_in_mid_strip_gives_no_name_a_second_time(tmp_path
     def renamed(camera):
         camera.name += " calibrated"
 
-    more = _let_in(low, "configuration/camera", 9.0, renamed)
+    more = _let_in(low, "configuration/camera", 5.5, renamed)
     summary, ties, told = run(tmp_path, sorted([*low, *more], key=lambda x: x.stamp_ns))
     assert "configuration changed: matching starts again" in told
     # lines that come before poses are counted as such, and no CCD line is silent for not having been heard before
@@ -391,7 +406,7 @@ def test_in_another_local_frame_matching_begins_again(tmp_path, low):
     def moved(project):
         project.origin_latitude += 0.01
 
-    more = _let_in(low, "configuration/project", 9.0, moved)
+    more = _let_in(low, "configuration/project", 5.5, moved)
     before, after = (local_frame(x.body) for x in (low[0], more[0]))
     assert low[0].topic == "configuration/project"
     for k, x in enumerate(x for x in low if x.topic == "observation/control"):
@@ -402,7 +417,7 @@ def test_in_another_local_frame_matching_begins_again(tmp_path, low):
     counted = summary.counters["matcher"]
     assert "configuration changed: matching starts again" in told
     assert not [text for text in told if "poor likeness" in text or "at the end of the line" in text], told
-    assert sum(not tie.point.startswith("S1-M") for tie in ties) > 10 and counted["target measured"] > 60
+    assert sum(not tie.point.startswith("S1-M") for tie in ties) > 10 and counted["target measured"] > 26
 
 
 def _mounted(messages, boresight_deg):
@@ -423,12 +438,6 @@ def _mounted(messages, boresight_deg):
         yield replace(x, body=body)
 
 
-def _whole(out):
-    """Perspective centres of the last answers."""
-    poses = [pose_sample(x.body) for x in RecordingReader(out).messages(["orientation/whole"])]
-    return np.array([pose.position_l for pose in poses])
-
-
 @pytest.mark.parametrize(
     ("heading_deg", "turns"), [(0.0, 0), (44.0, 0), (-46.0, 1), (-90.0, 1), (180.0, 2), (90.0, 3), (134.0, 3)]
 )
@@ -443,15 +452,11 @@ def test_a_mounting_is_quarters_of_a_turn_and_what_is_left(heading_deg, turns):
     assert R_fi[0, 0] > 0.65  # x goes along the flight
 
 
-def test_a_camera_may_be_mounted_turned_and_oblique(tmp_path, short):
+def test_a_camera_may_be_mounted_turned_and_oblique(tmp_path, short, alone):
     """The whole orientation is that of the same flight with a camera that is mounted straight."""
-    flown = {}
-    for name, sees in (("straight", short), ("turned", _mounted(short, (5.0, 25.0, 90.0)))):
-        folder = tmp_path / name
-        folder.mkdir()
-        summary, ties, _ = run(folder, sees)
-        assert not summary.counters["matcher"].get("malformed") and not summary.counters["adjuster"].get("malformed")
-        flown[name] = len(ties), _whole(folder / "out.mcap")
-    (number, expected), (found_number, found) = flown.values()
-    assert found_number > 0.85 * number > 30
+    summary, ties, _ = run(tmp_path, _mounted(short, (5.0, 25.0, 90.0)))
+    assert not summary.counters["matcher"].get("malformed") and not summary.counters["adjuster"].get("malformed")
+    straight, expected = alone
+    found = whole_orientation(tmp_path / "out.mcap")
+    assert len(ties) > 0.85 * len(straight) > 30
     assert len(found) == len(expected) and np.abs(found - expected).max() < 0.3
