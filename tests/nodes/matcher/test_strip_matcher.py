@@ -66,25 +66,25 @@ def recorded(satellite, seed):
     return messages, dict(zip((strip.id for strip in block.strips), sensors, strict=True)), block.frame
 
 
+@cache
 def matched(satellite, seed=2, **options):
     """Messages of the recording, those of the matcher's ties, the matcher, true places of its points, and by how much
     looks miss them."""
     messages, sensor, frame = recorded(satellite, seed)
     node = Matcher(**options)
     ties = [out for out in through(node, messages) if out.topic == "observation/tie"]
-    truth = {}
-    for tie in ties:
-        first = tie.body.images[0]
-        if tie.body.point not in truth:
-            ground = sensor[first.strip].ground([first.line], [first.sample], frame.height_m)[0]
-            truth[tie.body.point] = ground
-    missed = [
-        [image.line, image.sample] - sensor[image.strip].ground_to_pixel(truth[tie.body.point][None])[0]
-        for tie in ties
-        for image in tie.body.images
-    ]
+    firsts = {tie.body.point: tie.body.images[0] for tie in reversed(ties)}
+    truth, missed = {}, []
+    for strip in sensor:
+        own = {point: (image.line, image.sample) for point, image in firsts.items() if image.strip == strip}
+        ground = sensor[strip].ground(*np.reshape([*own.values()], (-1, 2)).T, frame.height_m)
+        truth |= dict(zip(own, ground, strict=True))
+    for strip in sensor:
+        looks = [(tie.body.point, image) for tie in ties for image in tie.body.images if image.strip == strip]
+        pixels = np.array([(image.line, image.sample) for _, image in looks])
+        missed.append(pixels - sensor[strip].ground_to_pixel(np.array([truth[point] for point, _ in looks])))
     local = {id: frame.R_el.T @ (ground - frame.origin_e) for id, ground in truth.items()}
-    return messages, ties, node, local, np.array(missed)
+    return messages, ties, node, local, np.concatenate(missed)
 
 
 def on_line(messages, ties):
@@ -198,6 +198,8 @@ def test_overpasses_of_one_lens():
 
 CAMERA = """{"name": "hyper", "lenses": [{"id": "L1", "focal_length_mm": 25.0}],
  "lines": [{"id": "N", "lens": "L1", "pixels": 500, "pixel_size_mm": 0.0384, "center_mm": [0.05, 0.0]}]}"""
+#: As many poses as such flights need, and such a camera.
+SENSORS = ("--attitude-rate", "50", "--sensor")
 
 
 def test_strips_of_one_ccd_line_in_any_direction_are_tied_by_their_images_alone(tmp_path, capsys):
@@ -212,7 +214,8 @@ def test_strips_of_one_ccd_line_in_any_direction_are_tied_by_their_images_alone(
     assert main([*simulate, "--control", "0", "--check", "0", "--lead-in", "3", "--seed", "3"]) == 0
     capsys.readouterr()
     settings = tmp_path / "nodes.toml"
-    settings.write_text("[matcher]\nground_m = 400.0\n")  # it is at 0 m, the camera at 1000 m
+    pace = "[navigator]\nfiltered_s = 0.02\n[adjuster]\nupdate_s = 0.5\nupdate_rays = 100\n"
+    settings.write_text(f"[matcher]\nground_m = 400.0\n{pace}")  # it is at 0 m, the camera at 1000 m
     nodes = ["--nodes", "navigator,matcher,adjuster", "--processes", "1", "--config", str(settings)]
     assert main(["process", str(flight), "-o", str(out), "-q", *nodes]) == 0
     assert "note:" not in capsys.readouterr().out
@@ -248,7 +251,7 @@ def test_a_strip_of_one_ccd_line_whose_end_nobody_tells_is_tied(tmp_path):
     sensor, flight, rest, out = (tmp_path / name for name in ("camera.json", "flight.mcap", "rest.mcap", "out.mcap"))
     sensor.write_text(CAMERA)
     plan = ["--strips", "2", "--sidelap", "0.6", "--seconds", "10", "--height", "1000", "--speed", "60", "--no-turns"]
-    simulate = ["simulate", "-q", "-o", str(flight), "--sensor", str(sensor), "--images", *plan, "--control", "0"]
+    simulate = ["simulate", "-q", "-o", str(flight), *SENSORS, str(sensor), "--images", *plan, "--control", "0"]
     assert main([*simulate, "--check", "0", "--lead-in", "6", "--lead-out", "6", "--seed", "3"]) == 0
     messages = [
         x for x in RecordingReader(flight).messages()
@@ -256,7 +259,7 @@ def test_a_strip_of_one_ccd_line_whose_end_nobody_tells_is_tied(tmp_path):
     ]  # fmt: skip
     write_recording(rest, messages)
     settings = tmp_path / "nodes.toml"
-    settings.write_text("[matcher]\nground_m = 0.0\n")
+    settings.write_text("[matcher]\nground_m = 0.0\n[adjuster]\nupdate_s = 1.0\nupdate_rays = 100\n")
     nodes = ["--nodes", "navigator,matcher,adjuster", "--processes", "1", "--config", str(settings)]
     assert main(["process", str(rest), "-o", str(out), "-q", *nodes]) == 0
     reader, seen = RecordingReader(out), {}
@@ -278,7 +281,7 @@ def test_matched_strips_of_one_ccd_line_are_as_good_as_they_say(world, tmp_path)
     sensor.write_text(CAMERA)
     other = {"relief of 150 m": ["--relief", "150"], "three times the turbulence": ["--turbulence", "3"]}
     plan = ["--strips", "3", "--cross", "1", "--sidelap", "0.5", "--seconds", "20", "--height", "1000", "--speed", "60"]
-    simulate = ["simulate", "-q", "-o", str(flight), "--sensor", str(sensor), "--images", *plan, "--no-turns"]
+    simulate = ["simulate", "-q", "-o", str(flight), *SENSORS, str(sensor), "--images", *plan, "--no-turns"]
     nees, squares = [], []
     for seed in range(11, 15):
         assert main([*simulate, "--control", "0", "--check", "30", "--seed", str(seed), *other.get(world, [])]) == 0
@@ -317,7 +320,7 @@ def flown_twice(tmp_path_factory):
         "--speed",
         "60",
     ]
-    simulate = ["simulate", "-q", "-o", str(flight), "--sensor", str(sensor), "--images", *plan, "--no-turns"]
+    simulate = ["simulate", "-q", "-o", str(flight), *SENSORS, str(sensor), "--images", *plan, "--no-turns"]
     assert main([*simulate, "--control", "0", "--check", "0", "--seed", "7"]) == 0
     assert main(["process", str(flight), "-o", str(out), "-q", "--nodes", "navigator", "--processes", "1"]) == 0
     return list(RecordingReader(out).messages())
