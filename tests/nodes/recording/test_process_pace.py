@@ -35,11 +35,21 @@ KINDS = ("attitude", "inertial")
 
 @pytest.fixture(scope="module")
 def flights(tmp_path_factory):
+    return recorded(tmp_path_factory, 12.0)
+
+
+@pytest.fixture(scope="module")
+def long_flights(tmp_path_factory):
+    return recorded(tmp_path_factory, 30.0)
+
+
+def recorded(tmp_path_factory, strip_s):
     """Recordings of a strip with its truth, by kind of navigation data."""
     found = {}
     for kind in KINDS:
         inertial = InertialPlan(TACTICAL, 100.0) if kind == "inertial" else None
-        plan = FlightPlan(strip_s=30.0, lead_in_s=20.0 if inertial else 3.0)  # an inertial filter aligns first
+        # an inertial filter aligns first
+        plan = FlightPlan(strip_s=strip_s, lead_in_s=20.0 if inertial else 3.0)
         simulation = simulate(plan, 4, ErrorModel(attitude_rate_hz=100.0, gnss_rate_hz=5.0), inertial=inertial)
         path = tmp_path_factory.mktemp(kind) / "flight.mcap"
         with RecordingWriter(path) as writer:
@@ -77,7 +87,7 @@ def test_what_only_the_last_node_needs_is_checked_by_the_process_ahead(flights, 
     spoilt = 0
     with RecordingWriter(path) as writer:
         for raw in reader.raws(reader.select()):
-            wrong = raw.topic in ("observation/tie", "sensor/gnss") and raw.envelope.sequence % 40 == 7
+            wrong = raw.topic in ("observation/tie", "sensor/gnss") and raw.envelope.sequence % 15 == 7
             writer.write_raw(raw._replace(data=b"\xff\xff") if wrong else raw)
             spoilt += wrong
     (alone, expected), (apart, found) = (processed(path, "throughput", two, copied=two) for two in (False, True))
@@ -91,7 +101,7 @@ def test_a_strip_that_was_cut_short_ends_as_on_the_bus(flights, tmp_path):
     """Ties are stamped ahead, and the navigator's last words come before those that are stamped after the last sensor:
     each node is given all its inputs in the order of their stamps."""
     reader, path = RecordingReader(flights["attitude"][1]), tmp_path / "cut.mcap"
-    end_ns = reader.first("configuration/strip").first_line_time_ns + 11 * 10**9
+    end_ns = reader.first("configuration/strip").first_line_time_ns + 8 * 10**9
     kept = []
     for raw in reader.raws(reader.select()):
         if raw.envelope.stamp_ns <= end_ns:
@@ -153,8 +163,8 @@ def test_what_is_wrong_in_the_other_process_is_told_here():
 
 @pytest.mark.study
 @pytest.mark.parametrize("kind", KINDS)
-def test_results_for_throughput_are_as_good(flights, tmp_path, kind):
-    simulation, path = flights[kind]
+def test_results_for_throughput_are_as_good(long_flights, tmp_path, kind):
+    simulation, path = long_flights[kind]
     found = {}
     for pace in ("load", "throughput"):
         summary, content = processed(path, pace)
@@ -182,7 +192,7 @@ def test_results_for_throughput_are_as_good(flights, tmp_path, kind):
 def test_what_is_in_doubt_is_looked_at_more_often(tmp_path):
     """A vibration that nobody stated is found at the pace for throughput, too, and the sigmas hold over flights."""
     world = World(sines=(Sine((0.01, 0.01, 0.01), 3.0),))
-    plan, path, done = FlightPlan(strip_s=60.0, lead_in_s=5.0, lead_out_s=3.0), tmp_path / "in", tmp_path / "out"
+    plan, path, done = FlightPlan(strip_s=40.0, lead_in_s=3.0, lead_out_s=3.0), tmp_path / "in", tmp_path / "out"
     nees = []
     for seed in (2, 3, 4):
         simulation = simulate(plan, seed, SETTINGS["rtk"], OBSERVED, world=world)
