@@ -20,7 +20,7 @@ TIES_FROM_S = 9.5
 
 
 def flown(ties_per_s):
-    """What an adjuster gets of a low strip of 12 s, with the tie points of its last seconds, looks at a point together."""
+    """What an adjuster gets of a low strip of 12 s, with tie points in its last seconds, looks at a point together."""
     plan = FlightPlan(height_m=700.0, strip_s=12.0, lead_in_s=1.0, lead_out_s=1.0)
     errors = ErrorModel(attitude_rate_hz=RATE_HZ)
     simulation = simulate(plan, 3, errors, ObservationPlan(tie_points_per_s=ties_per_s, check=0))
