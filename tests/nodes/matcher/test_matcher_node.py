@@ -365,7 +365,7 @@ def test_control_that_does_not_count_tells_no_height_of_the_ground(short):
 
 @pytest.fixture(scope="module")
 def low():
-    """Flown so low that all looks at a point are there after 6 s."""
+    """Flown so low and fast that all looks at a point are there after 3.5 s."""
     flight = simulated_flight({**SETTINGS, "height": 300.0, "seconds": 11.0})
     return list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
 
