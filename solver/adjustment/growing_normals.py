@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 from scipy.sparse import csr_array
 
 from ..arrays import Array, Bools, IntArray
-from .frontal import FrontalFactor, Fronts
+from .frontal import FrontalFactor, FrontalMatrix, Fronts
 from .in_parts import Cost, Parts
 from .nested_dissection import Dissection, find_fronts
 from .reduced_system import ROUNDING, cholesky, scale_of
@@ -35,7 +35,15 @@ LOOKED_UP = 2e4
 
 @dataclass(frozen=True)
 class _Groups:
-    """Unknowns of the same cell: ``members[begin[g] : begin[g + 1]]`` of group g, of ``cell[g]``."""
+    """Unknowns (n,) in groups, which are of one cell each and stay together.
+
+    Attributes
+    ----------
+    cell : of each of g groups
+    members, begin : (n,), (g + 1,) ``members[begin[i] : begin[i + 1]]`` are the places of group i among the unknowns
+    of_unknown : (n,) group of each
+    kept : (g,) whether a group stays when the others are closed
+    """
 
     cell: list[int]
     members: IntArray
@@ -67,9 +75,6 @@ class BlockNormals:
         """Numbers, ascending, of the unknowns of cells that something is known of."""
         parts = [cell * CELL + np.flatnonzero(self._known[self._row[cell]]) for cell in sorted(cells)]
         return np.concatenate([np.empty(0, dtype=np.int64), *parts])
-
-    def __len__(self) -> int:
-        return int(self._known.sum())
 
     def add(self, numbers: IntArray, matrix: Array, rhs: Array) -> None:
         """Add information (u, u), (u,) about different unknowns (u,)."""
@@ -121,11 +126,6 @@ class BlockNormals:
         rows = np.array([self._row.get(cell, -1) for cell in (numbers // CELL).tolist()], dtype=np.int64)
         return np.where(rows >= 0, self._rhs[rows, numbers % CELL], 0.0)
 
-    def work(self, numbers: IntArray) -> Dissection:
-        """How a solution of unknowns (n,), ascending, takes them apart."""
-        groups = self._groups(numbers, np.empty(0, dtype=np.int64))
-        return self._dissect(groups)
-
     def solving(self, numbers: IntArray, weight: Array) -> Generator[Cost, None, tuple[Array, FrontalFactor]]:
         """Values (n,) of unknowns (n,), ascending, and the factor of their equations, where all others are zero.
 
@@ -147,10 +147,7 @@ class BlockNormals:
         """Numbers, ascending, of the unknowns in cells that unknowns (n,) have entries with, without these."""
         own = set((numbers // CELL).tolist())
         cells = {b if a in own else a for a, b in self._slot if (a in own) or (b in own)} | own
-        parts = [
-            cell * CELL + np.flatnonzero(self._known[self._row[cell]]) for cell in sorted(cells & self._row.keys())
-        ]
-        return np.setdiff1d(np.concatenate([np.empty(0, dtype=np.int64), *parts]), numbers)
+        return np.setdiff1d(self._known_in(cells & self._row.keys()), numbers)
 
     def close(self, numbers: IntArray, weight: Array) -> Parts:
         """Let unknowns (n,) go, of which nothing else will be said: what they say of others stays (Schur complement).
@@ -234,9 +231,7 @@ class BlockNormals:
         """The equations of unknowns (n,) as columns of the fronts, without what each says of its own unknowns above the
         diagonal."""
         d = dissection
-        panels: list[Array] = []
-        for m, rows in zip(np.diff(d.bounds).tolist(), d.rows, strict=True):
-            panels.append(np.zeros((m + len(rows), m)))
+        panels = FrontalMatrix(d).panels
         first = d.position[groups.members[groups.begin[:-1]]]
         front = np.searchsorted(d.bounds, first, side="right") - 1
         within = numbers % CELL

@@ -39,7 +39,8 @@ BLOCK_UNKNOWNS = 20000
 #: together when the second is over; then the first one is closed. Tuned.
 MOST_OF_STRIP = 16000
 #: Unknowns that a strip which is closed may have met, at most: what it says of them is a full matrix, in all solutions
-#: from then on. One that has met more leaves nothing. Tuned: that of 200 MB.
+#: from then on. Where one has met more all strips are closed, which leave what they say of the camera and of the
+#: platform. Tuned: a matrix of 200 MB.
 MOST_MET = 5000
 #: A-priori equations of a strip that are added to those of the block at a time: all unknowns of a long strip as one
 #: dense matrix would be 60 MB, several times over.
