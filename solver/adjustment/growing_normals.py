@@ -22,8 +22,8 @@ from .in_parts import Cost, Parts
 from .nested_dissection import Dissection, find_fronts
 from .reduced_system import ROUNDING, cholesky, scale_of
 
-#: Unknowns of a cell, some seconds of a strip. Tuned: a solution takes a tenth longer with half as many, and a fifth less
-#: with twice as many, which take half as much memory again.
+#: Unknowns of a cell, some seconds of a strip. Tuned: a solution takes a tenth longer with half as many, and a fifth
+#: less with twice as many, which take half as much memory again.
 CELL = 48
 #: Cells that there is room for at first, and the factor by which the room grows. Memory that nothing was written to is
 #: not taken from the system.
