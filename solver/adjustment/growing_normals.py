@@ -141,6 +141,7 @@ class BlockNormals:
         panels = yield from self._panels(groups, numbers, weight, dissection)
         reference = np.concatenate([np.diagonal(panel) for panel in panels])
         factor = yield from FrontalFactor.in_parts(dissection, panels, reference)
+        del panels  # as large as the factor, and as what comes now
         yield from factor.selecting()
         return factor.solve(self.rhs(numbers)), factor
 

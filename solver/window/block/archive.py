@@ -32,12 +32,12 @@ from .backward import LeftOrientation, LeftPoints
 from .points import KeptPoint, SingleLook, rows_of
 from .solution import BlockSolution
 
-#: Unknowns of the strips kept together, about fifty minutes of strips; beyond that the oldest strip is refined no more.
-#: Equations and factor take 0.6 GB then. Tuned: a solution is the work of a turn of a minute.
-BLOCK_UNKNOWNS = 20000
-#: Unknowns of one strip, at most, for it to be part of a block: about forty minutes. Two of them are still solved
+#: Unknowns of the strips kept together, about half an hour of strips; beyond that the oldest strip is refined no more.
+#: Tuned by memory: with 20 000 the adjuster has peaks of 1.9 GB (`bench/long_flight.py`).
+BLOCK_UNKNOWNS = 12000
+#: Unknowns of one strip, at most, for it to be part of a block: about 25 minutes. Two of them are still solved
 #: together when the second is over; then the first one is closed. Tuned.
-MOST_OF_STRIP = 16000
+MOST_OF_STRIP = 10000
 #: Unknowns that a strip which is closed may have met, at most: what it says of them is a full matrix, in all solutions
 #: from then on. Where one has met more all strips are closed, which leave what they say of the camera and of the
 #: platform. Tuned: a matrix of 200 MB.

@@ -108,8 +108,8 @@ def test_the_backward_pass_of_the_block_is_that_of_the_window_where_there_is_one
     assert block.whole_points.keys() == chain.whole_points.keys()
 
 
-def test_a_strip_of_forty_minutes_has_room_in_a_block():
-    strip = WindowStrip("S1", 0.0, 200.0, 2400 * 200, slow_errors_of(SENSORS), WindowOptions(), WindowState())
+def test_a_strip_of_25_minutes_has_room_in_a_block():
+    strip = WindowStrip("S1", 0.0, 200.0, 1500 * 200, slow_errors_of(SENSORS), WindowOptions(), WindowState())
     assert len(strip.numbers) <= window_archive.MOST_OF_STRIP
 
 
