@@ -96,38 +96,46 @@ class Fronts:
         self._dissection, self._panels = dissection, panels
         self._waiting: list[list[tuple[IntArray, Array]]] = [[] for _ in panels]
 
-    def assembled(self, t: int) -> Array:
-        """A front (own + rows, own + rows): its lower triangle, with what those that hang on it have left."""
-        panel = self._panels[t]
-        front = np.zeros((len(panel), len(panel)))
-        front[:, : panel.shape[1]] = panel
-        for rows, rest in self._waiting[t]:
+    def assembled(self, t: int) -> tuple[Array, Array]:
+        """A front with what those that hang on it have left: columns of its own unknowns (own + rows, own), and what is
+        known of the others (rows, rows); only the lower triangle counts."""
+        columns = self._panels[t].copy()
+        own = columns.shape[1]
+        rest = np.zeros((len(columns) - own, len(columns) - own))
+        waiting, self._waiting[t] = self._waiting[t], []
+        while waiting:
+            rows, left = waiting.pop()
             at = self._dissection.local(t, rows)
-            front[np.ix_(at, at)] += rest
-        self._waiting[t] = []
-        return front
+            low = int(np.searchsorted(at, own))
+            columns[np.ix_(at, at[:low])] += left[:, :low]
+            rest[np.ix_(at[low:] - own, at[low:] - own)] += left[low:, low:]
+        return columns, rest
 
-    def eliminating(self, t: int, front: Array, L: Array) -> Generator[Cost, None, Array]:
-        """Columns (own + rows, own) of the factor, given that of the own unknowns; in parts."""
-        d, size, own = self._dissection, len(front), len(L)
-        factor = np.empty((size, own))
-        factor[:own] = L
+    def eliminating(self, t: int, columns: Array, rest: Array, L: Array) -> Generator[Cost, None, Array]:
+        """Columns (own + rows, own) of the factor, given that of the own unknowns; in parts.
+
+        Parameters
+        ----------
+        columns, rest : the front as assembled, whose memory is used again
+        """
+        d, size, own = self._dissection, len(columns), len(L)
+        columns[:own] = L
         cost = FRONT + own**3 / 3.0
         if size > own:
-            below = factor[own:]
-            below[:] = solve_triangular(L, front[own:, :own].T, lower=True, check_finite=False).T
+            below = columns[own:]
+            below[:] = solve_triangular(L, below.T, lower=True, check_finite=False).T
             cost += float(own) ** 2 * (size - own)
             if d.parent[t] >= 0:
-                rest = front[own:, own:].copy()
-                for begin in range(0, size - own, ROWS):
-                    rest[begin : begin + ROWS] -= below[begin : begin + ROWS] @ below.T
-                    cost += 2.0 * min(ROWS, size - own - begin) * (size - own) * own
+                for begin in range(0, len(rest), ROWS):
+                    end = min(begin + ROWS, len(rest))
+                    rest[begin:end, :end] -= below[begin:end] @ below[:end].T
+                    cost += 2.0 * (end - begin) * end * own
                     if cost > LARGE:
                         yield cost
                         cost = 0.0
                 self._waiting[int(d.parent[t])].append((d.rows[t], rest))
         yield cost
-        return factor
+        return columns
 
 
 @dataclass(frozen=True)
@@ -204,11 +212,11 @@ class FrontalFactor:
         self._L: list[Array] = []
         fronts = Fronts(self.dissection, self._panels)
         for t in range(len(self._panels)):
-            front = fronts.assembled(t)
-            L, sound = cholesky(front[: self._panels[t].shape[1], : self._panels[t].shape[1]], raised, limit)
+            columns, rest = fronts.assembled(t)
+            L, sound = cholesky(columns[: columns.shape[1]], raised, limit)
             if not sound:
                 return False
-            self._L.append((yield from fronts.eliminating(t, front, L)))
+            self._L.append((yield from fronts.eliminating(t, columns, rest, L)))
         return True
 
     def _solve(self, b: Array) -> Array:
@@ -253,37 +261,38 @@ class FrontalFactor:
 
     def _inverse(self) -> Generator[Cost, None, list[Array]]:
         """Columns (own + rows, own) of the scaled inverse, from the last front to the first."""
-        d, count = self.dissection, len(self._L)
+        count = len(self._L)
         z: list[Array] = [np.empty(0)] * count
-        whole: dict[int, Array] = {}  # inverse over own and rows, of fronts that others hang on
-        left = np.bincount(d.parent[d.parent >= 0], minlength=count)
         for t in range(count - 1, -1, -1):
             factor = self._L[t]
             size, m = factor.shape
             own = inverse_of(factor[:m])
             columns = np.empty((size, m))
-            below = np.empty((0, 0))
             if size > m:
-                up = int(d.parent[t])
-                at = d.local(up, d.rows[t])
-                below = whole[up][np.ix_(at, at)]
+                below = self._among(z, self.dissection.rows[t])
+                assert below is not None  # what a front has entries with has entries with each other
                 X = solve_triangular(factor[:m], factor[m:].T, lower=True, trans=1, check_finite=False).T
                 columns[m:] = -below @ X
                 own = own - X.T @ columns[m:]
             columns[:m] = 0.5 * (own + own.T)
             z[t] = columns
-            if d.parent[t] >= 0:
-                left[d.parent[t]] -= 1
-                if not left[d.parent[t]]:
-                    whole.pop(int(d.parent[t]), None)
-            if left[t]:
-                full = np.empty((size, size))
-                full[:, :m] = columns
-                full[:m, m:] = columns[m:].T
-                full[m:, m:] = below
-                whole[t] = full
             yield FRONT + 2.0 * size * size * m
         return z
+
+    def _among(self, z: list[Array], place: IntArray) -> Array | None:
+        """Scaled inverse (m, m) among ascending places (m,) from its columns; None where two of them do not meet."""
+        d, Q = self.dissection, np.empty((len(place), len(place)))
+        for t, low, high in pieces(d, place):
+            later = place[high:]
+            at = np.searchsorted(d.rows[t], later)
+            if len(later) and not (at.max() < len(d.rows[t]) and (d.rows[t][at] == later).all()):
+                return None
+            m = z[t].shape[1]
+            own = place[low:high] - d.bounds[t]
+            Q[low:high, low:high] = z[t][np.ix_(own, own)]
+            Q[high:, low:high] = z[t][np.ix_(at + m, own)]
+            Q[low:high, high:] = Q[high:, low:high].T
+        return Q
 
     def rooted(self, columns: IntArray, functions: Array) -> Root:
         """Functions (k, m) of some unknowns (m,), so that `Root.joint` gives the cofactors between any two of them.
@@ -312,23 +321,13 @@ class FrontalFactor:
 
     def cofactors(self, columns: IntArray) -> Array:
         """Block (m, m) of the cofactor matrix; cheap where all of the unknowns meet."""
-        d = self.dissection
-        place = d.position[columns]
+        place = self.dissection.position[columns]
         order = np.argsort(place)
         sorted_place = place[order]
-        Q = np.empty((len(place), len(place)))
-        z = self._selected()
-        for t, low, high in pieces(d, sorted_place):
-            later = sorted_place[high:]
-            at = np.searchsorted(d.rows[t], later)
-            if len(later) and not (at.max() < len(d.rows[t]) and (d.rows[t][at] == later).all()):
-                root = self.rooted(columns, np.eye(len(columns)))
-                return root.joint(root)
-            m = z[t].shape[1]
-            own = sorted_place[low:high] - d.bounds[t]
-            Q[low:high, low:high] = z[t][np.ix_(own, own)]
-            Q[high:, low:high] = z[t][np.ix_(at + m, own)]
-            Q[low:high, high:] = Q[high:, low:high].T
+        Q = self._among(self._selected(), sorted_place)
+        if Q is None:
+            root = self.rooted(columns, np.eye(len(columns)))
+            return root.joint(root)
         null = self._null[sorted_place]
         Q -= null @ null.T / RAISED
         scale = self._scale[sorted_place]

@@ -20,7 +20,7 @@ from ..arrays import Array, Bools, IntArray
 from .frontal import FrontalFactor, FrontalMatrix, Fronts
 from .in_parts import Cost, Parts
 from .nested_dissection import Dissection, find_fronts
-from .reduced_system import ROUNDING, cholesky, scale_of
+from .reduced_system import ROUNDING, cholesky, mirror, scale_of
 
 #: Unknowns of a cell, some seconds of a strip. Tuned: a solution takes a tenth longer with half as many, and a fifth
 #: less with twice as many, which take half as much memory again.
@@ -181,17 +181,19 @@ class BlockNormals:
             here = slice(int(d.bounds[t]), int(d.bounds[t + 1]))
             panels[t] *= np.concatenate([scale[here], scale[d.rows[t]]])[:, None]
             panels[t] *= scale[here]
-            front, m = fronts.assembled(t), panels[t].shape[1]
-            L, sound = cholesky(front[:m, :m], 0.0, 10 * ROUNDING)
+            columns, rest = fronts.assembled(t)
+            m = columns.shape[1]
+            L, sound = cholesky(columns[:m], 0.0, 10 * ROUNDING)
             if not sound:
                 raise np.linalg.LinAlgError("unknowns that are to be closed are undetermined")
-            factor = yield from fronts.eliminating(t, front, L)
+            factor = yield from fronts.eliminating(t, columns, rest, L)
             y = solve_triangular(L, rhs[here] * scale[here], lower=True, check_finite=False)
             rhs[d.rows[t]] -= (factor[m:] @ y) / scale[d.rows[t]]
         self.drop(numbers)
         if len(met):
             panels[-1][:] = 0.0
-            less = fronts.assembled(len(panels) - 1)
+            less, _ = fronts.assembled(len(panels) - 1)
+            mirror(less)
             place = d.position[np.searchsorted(every, met)] - own
             less = less[np.ix_(place, place)]
             self.add(met, less, rhs[own:][place] - self.rhs(met))
