@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...schemas.image_lines import LineBlock
 from ...solver.camera.line_camera import LineCamera
-from ...solver.geometry.frames import LocalFrame, R_lc_from_navigation, known_crs
+from ...solver.geometry.frames import LocalFrame, known_crs
 from ...solver.geometry.rotation import quaternion_from_matrix
 from ...solver.orthoimage.error_band import GroundErrors
 from ...solver.orthoimage.ground_grid import GroundGrid, utm_of
@@ -28,8 +28,7 @@ from ..errors import UserError
 from ..formats.camera_json import read_camera_instead
 from ..formats.geotiff import Heights
 from ..formats.line_orientation import OrientedLines
-from ..formats.projection import refuse_missing_grids
-from ..formats.trajectory_csv import read_local_poses, read_trajectory_csv
+from ..formats.trajectory_csv import Poses, read_poses_of_strips
 from ..recording.access import PoseTable, Recording
 from ..voices import VERDICT, RecordedVoices
 
@@ -326,28 +325,68 @@ def _regular(strip: Any, lines: int) -> NDArray[np.int64]:
     return int(strip.first_line_time_ns) + np.rint(np.arange(lines) * (1e9 / strip.line_rate_hz)).astype(np.int64)
 
 
-def trajectory_orientation(recording: Recording, path: Path) -> tuple[LineOrientation, int]:
-    """The orientation in a table that `triline adjust` or `triline export --per-line` wrote, and its reference stamp.
+class OfTable:
+    """Orientation of strips by a table that `triline adjust` or `triline export --per-line` wrote.
+
+    Where it says in a column ``strip`` which one its rows are of, each strip has those of its own, or those of its
+    lens, where lenses were adjusted separately; else all rows count by their times alone.
+
+    Parameters
+    ----------
+    path : of the table
+    wanted : strips that it must have; None for all of the recording, of which it must have one
+    lens : of the lines
+
+    Attributes
+    ----------
+    orientation : of all these strips together
+    reference_ns : stamp that times count from
+    missing : strips of the recording that are not taken, where it tells strips
 
     Raises
     ------
     UserError : no such table, or one of another flight
     """
-    frame = project_frame(recording)
-    if frame.crs == "local":
-        position, R, time_ns = read_local_poses(path)
-    else:
-        refuse_missing_grids(frame.crs, path)
-        track = read_trajectory_csv(path, frame.crs)
-        position = frame.from_geodetic(*track.geodetic.T)
-        R, time_ns = R_lc_from_navigation(frame, position, track.rpy), track.time_ns
-    spans = [int(message.body.first_line_time_ns) for message in recording.messages("configuration/strip")]
-    rounded_ns = round(SAME_S * convert.SECOND_NS)
-    if not any(time_ns[0] - rounded_ns <= start <= time_ns[-1] + rounded_ns for start in spans):
-        raise UserError(f"{path}: its times do not reach the strips of {recording.reader.path}, wanted the same flight")
-    seconds = (time_ns - time_ns[0]) * 1e-9
-    gap_s = max(0.3, 2.5 * float(np.median(np.diff(seconds))))
-    return LineOrientation(seconds, position, quaternion_from_matrix(R), gap_s), int(time_ns[0])
+
+    def __init__(self, recording: Recording, path: Path, wanted: list[str] | None = None, lens: str = "") -> None:
+        poses = read_poses_of_strips(path, project_frame(recording))
+        found: dict[str | None, Poses] = {}
+        if not poses.rows:
+            found[None] = poses.of(None)
+        for strip in (wanted or list(recording.last_strips())) if poses.rows else ():
+            name = next((n for n in (strip, f"{strip}/{lens}") if n in poses.rows), None)
+            if name is not None or wanted:
+                found[strip] = poses.of(name or strip)
+        if not found:
+            strips = ", ".join(recording.last_strips())
+            raise UserError(
+                f"{path}: strip: {', '.join(poses.rows)}, wanted one of those of {recording.reader.path}: {strips}"
+            )
+        time_ns = np.concatenate([time_ns for _, _, time_ns in found.values()])
+        starts = [int(strip.first_line_time_ns) for strip in recording.last_strips().values()]
+        rounded_ns = round(SAME_S * convert.SECOND_NS)
+        if not any(time_ns.min() - rounded_ns <= start <= time_ns.max() + rounded_ns for start in starts):
+            raise UserError(
+                f"{path}: its times do not reach the strips of {recording.reader.path}, wanted the same flight"
+            )
+        self.reference_ns = int(time_ns.min())
+        self._of = {strip: self._orientation(*of) for strip, of in found.items()}
+        self.missing = [] if None in found else [strip for strip in recording.last_strips() if strip not in found]
+        if len(found) == 1:
+            self.orientation = next(iter(self._of.values()))
+        else:
+            first = np.unique(time_ns, return_index=True)[1]
+            position, R = (np.concatenate([of[k] for of in found.values()])[first] for k in range(2))
+            self.orientation = self._orientation(position, R, time_ns[first])
+
+    def __call__(self, strip: str) -> LineOrientation | None:
+        """That of a strip, None where the table has not this strip."""
+        return self._of.get(None, self._of.get(strip))
+
+    def _orientation(self, position: Array, R: Array, time_ns: NDArray[np.int64]) -> LineOrientation:
+        seconds = (time_ns - self.reference_ns) * 1e-9
+        gap_s = max(0.3, 2.5 * float(np.median(np.diff(seconds))))
+        return LineOrientation(seconds, position, quaternion_from_matrix(R), gap_s)
 
 
 def _ground_with_height(recording: Recording) -> dict[str, Any]:
@@ -416,7 +455,8 @@ class Rectification:
     ----------
     camera, ccd : camera, and the index of its CCD line
     surface, grid, resampling : as in `StripRectifier`
-    orientation, reference_ns : of the lines of a strip, by its name, and what its times count from
+    orientation, reference_ns : of the lines of a strip, by its name, None where it has none, and what its times count
+        from
     factor : pixels that are put together to one, along and across, where cells are that much larger
     errors : besides those of the orientation; then the orthoimage has sigmas
     mosaic : makes what the cells go into, from the data type of the lines
@@ -425,7 +465,7 @@ class Rectification:
 
     def __init__(
         self, camera: LineCamera, ccd: int, surface: Surface, grid: GroundGrid, resampling: str,
-        orientation: Callable[[str], LineOrientation], reference_ns: int, factor: int = 1,
+        orientation: Callable[[str], LineOrientation | None], reference_ns: int, factor: int = 1,
         errors: GroundErrors | None = None, mosaic: Callable[[np.dtype], Mosaic] = Mosaic,
         shadows: Shadows | None = None,
     ) -> None:  # fmt: skip
@@ -506,7 +546,10 @@ class Rectification:
             self._place(small, together, time_s[:used].reshape(n, f).mean(axis=1), first // f)
 
     def _place(self, pixels: NDArray[Any], usable: NDArray[np.bool_], time_s: Array, first: int) -> None:
-        assert self.result is not None and self._rectifier is not None and self._of_strip is not None
+        assert self.result is not None and self._rectifier is not None
+        if self._of_strip is None:
+            self._leave_out("without orientation", self.factor * int(usable.sum()))
+            return
         known = self._of_strip.covers(time_s)
         self._leave_out("without orientation", self.factor * int((usable & ~known).sum()))
         edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))

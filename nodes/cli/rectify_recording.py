@@ -20,7 +20,7 @@ from ...solver.rectification.relief_shadows import ReliefShadows
 from ..batch.rectification import (
     REFINED,
     OfStrips,
-    always,
+    OfTable,
     camera_beside,
     estimated_camera,
     frame_for,
@@ -29,7 +29,6 @@ from ..batch.rectification import (
     orientation_of,
     pixel_on_ground,
     project_frame,
-    trajectory_orientation,
 )
 from ..config import raster_of_heights
 from ..errors import UserError
@@ -55,7 +54,7 @@ class Prepared:
     ----------
     camera, ccd : camera, and the index of its CCD line
     orientation_name, orientation, reference_ns : of the lines
-    of_strip : orientation of each strip, by its name
+    of_strip : orientation of each strip, by its name; None of one that a table has not
     estimated, of_camera : how many parameters of the camera were estimated; the file of the camera, if it has one
     target : the local frame with the CRS of the cells
     surface, ground : what rays meet, and its name
@@ -71,7 +70,7 @@ class Prepared:
     orientation_name: str
     orientation: LineOrientation
     reference_ns: int
-    of_strip: Callable[[str], LineOrientation]
+    of_strip: Callable[[str], LineOrientation | None]
     estimated: int
     of_camera: Path | None
     target: LocalFrame
@@ -99,8 +98,10 @@ def prepared(args: argparse.Namespace, path: Path) -> Prepared:
     notes: list[str] = []
     if args.trajectory is not None:
         name = args.trajectory.name
-        orientation, reference_ns = trajectory_orientation(recording, args.trajectory)
-        of_strip = always(orientation)
+        of_strip = OfTable(recording, args.trajectory, args.strip, camera.lines[ccd].lens)
+        orientation, reference_ns = of_strip.orientation, of_strip.reference_ns
+        if of_strip.missing and not args.strip:
+            notes.append(f"{name} has no rows of strip {', '.join(of_strip.missing)}")
         if args.camera is None:
             camera, of_camera = camera_beside(args.trajectory, camera, notes)
     else:

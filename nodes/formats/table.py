@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -100,11 +100,13 @@ class Table:
     path : file
     values : by name of the `Column`
     headed : what the file calls a column that has another name there
+    rows : number of each row in the file, from 0; None for all in their order
     """
 
     path: Path
     values: Mapping[str, NDArray[Any]] = field(repr=False)
     headed: Mapping[str, str] = field(default_factory=dict)
+    rows: NDArray[np.intp] | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         return len(next(iter(self.values.values())))
@@ -119,8 +121,14 @@ class Table:
         """Number columns side by side, (rows, len(names))."""
         return np.column_stack([self.values[name] for name in names]).astype(float)
 
+    def part(self, which: NDArray[np.bool_]) -> Table:
+        """Some of the rows."""
+        rows = np.flatnonzero(which) if self.rows is None else self.rows[which]
+        return replace(self, values={name: column[which] for name, column in self.values.items()}, rows=rows)
+
     def line_of(self, row: int) -> int:
         """Line number in the file (from 1) of a row (from 0)."""
+        row = row if self.rows is None else int(self.rows[row])
         with _open(self.path) as file:
             for place, (line, _) in enumerate(_rows(file, separator_of(self.path)[0])):
                 if place == row + 1:

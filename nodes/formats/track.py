@@ -126,13 +126,18 @@ class NavigationTrack:
         return self.covariance_n is not None or (self.sigma_ned_m is not None and self.sigma_rpy is not None)
 
 
-def checked(track: NavigationTrack, path: Path) -> NavigationTrack:
+def checked(track: NavigationTrack, path: Path, rows: NDArray[np.intp] | None = None) -> NavigationTrack:
     """The track without poses that do not come after the one before them.
+
+    Parameters
+    ----------
+    rows : (n,) number of each pose's record in the file, from 0; None where the track has all of them
 
     Raises
     ------
     UserError : values that no pose can have (by the number of the record), or fewer than two poses
     """
+    number = np.arange(len(track)) + 1 if rows is None else rows + 1
     lat, lon, height = track.geodetic.T
     for name, values, low, high, unit in (
         ("latitude", lat, -90, 90, "deg"),
@@ -146,11 +151,11 @@ def checked(track: NavigationTrack, path: Path) -> NavigationTrack:
         if len(bad):
             more = f" (and {len(bad) - 1} more like it)" if len(bad) > 1 else ""
             what = f"{values[bad[0]]:.6g}, wanted {low:g} to {high:g} {unit}"
-            raise UserError(f"{path}: record {bad[0] + 1}: {name}: {what}{more}")
+            raise UserError(f"{path}: record {number[bad[0]]}: {name}: {what}{more}")
     old = np.flatnonzero(track.time_ns < 0)
     if len(old):
         when = np.datetime64(int(track.time_ns[old[0]]), "ns").astype("datetime64[s]")
-        raise UserError(f"{path}: record {old[0] + 1}: time: {when} is before 1970, wanted UTC since then")
+        raise UserError(f"{path}: record {number[old[0]]}: time: {when} is before 1970, wanted UTC since then")
     newest = np.maximum.accumulate(track.time_ns)
     rising = np.concatenate([[True], track.time_ns[1:] > newest[:-1]])
     if rising.sum() < 2:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
 import numpy as np
 
-from ...solver.geometry.frames import CrsError, LocalFrame, navigation_from_R_lc
+from ...solver.geometry.frames import CrsError, LocalFrame, R_lc_from_navigation, navigation_from_R_lc
 from ...solver.geometry.rotation import angles_jacobian, matrix_from_angles
 from ..errors import UserError
 from .place_columns import PLACE, check_place_units, place_column
@@ -40,7 +41,12 @@ _PHOTOGRAMMETRIC = (*(place_column(name) for name in PLACE), *(Column(name) for 
 _NED = ("sigma_n_m", "sigma_e_m", "sigma_d_m")
 _RPY = ("sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg")
 _XYZ_OPK = tuple(f"sigma_{name}" for name in (*PLACE, *_OPK))
+#: Of a table with several strips: which one a row is of.
+_STRIP = Column("strip", "text", blank=True)
 _UNITS = {"deg": "deg", "degree": "deg", "degrees": "deg", "rad": "rad", "radian": "rad", "radians": "rad", "m": "m"}
+
+#: Perspective centres (n, 3) in the local frame, rotations image to local (n, 3, 3), and UTC (n,) in ns.
+Poses = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def is_trajectory_csv(path: Path) -> bool:
@@ -78,23 +84,32 @@ def read_trajectory_csv(path: Path, crs: str | None = None, day: date | None = N
     UserError : ``file:line: column: what is wrong``, angles that cannot be in the unit that the header states
     """
     notes: list[str] = []
-    header = column_names_of(path)
-    time = time_columns(header)
-    if not time:
-        raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}{separator_hint(header)}")
+    return _track(_track_table(path, crs, notes), crs, day, notes)
+
+
+def _track_table(path: Path, crs: str | None, notes: list[str], *more: Column) -> Table:
+    """The columns that `_track` needs, with more of them where the file has them."""
+    header, time = _header(path)
     photogrammetric = _is_photogrammetric(header)
     names = {} if photogrammetric else _columns(path, header)
     wanted = _PHOTOGRAMMETRIC if photogrammetric else tuple(Column(name) for name in names.values())
     placed = photogrammetric and crs in (None, "local") and set(_GEODETIC) <= set(header)
     columns = [*time, *wanted, *(Column(name) for name in _GEODETIC if placed)]
-    sigmas = (*_NED, *_RPY) if set(_NED) <= set(header) else tuple(f"{name}_sigma" for name in _NAVIGATION)
-    sigmas = _XYZ_OPK if photogrammetric else sigmas
+    sigmas = _sigmas_of(header)
     columns += [Column(name, low=0.0, blank=photogrammetric) for name in sigmas if name in header]
-    table = read_table(path, columns, notes)
+    table = read_table(path, [*columns, *more], notes)
     missing = [name for name in sigmas if name not in table]
-    given = not missing
     if 0 < len(missing) < len(sigmas):
         notes.append(f"{path.name}: no column {', '.join(missing)}: the other sigmas do not count")
+    return table
+
+
+def _track(table: Table, crs: str | None, day: date | None, notes: list[str]) -> NavigationTrack:
+    """The poses of a table, which `_track_table` has read, or of some of its rows."""
+    path, time, photogrammetric = table.path, time_columns(table.values), _is_photogrammetric(table.values)
+    names = {} if photogrammetric else _columns(path, list(table.values))
+    sigmas = _sigmas_of(table.values)
+    given = all(name in table for name in sigmas)
     time_ns = times_of(table, time, day, notes)
     late = np.concatenate([[False], np.diff(time_ns) <= 0])
     seconds = time_ns * 1e-9
@@ -112,24 +127,23 @@ def read_trajectory_csv(path: Path, crs: str | None = None, day: date | None = N
     track = NavigationTrack(
         path.stem, time_ns, geodetic, rpy, sigma_m, sigma_rpy, notes=tuple(notes), covariance_n=covariance
     )
-    return check_units(checked(track, path), path, names)
+    return check_units(checked(track, path, table.rows), path, names)
 
 
-def read_local_poses(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Perspective centres (n, 3), rotations image to local (n, 3, 3) and UTC (n,) in ns, in time order.
+def _local_table(path: Path, *more: Column) -> Table:
+    """The columns that `_local_poses` needs, with more of them where the file has them."""
+    time = _header(path)[1]
+    return read_table(path, [*time, *(Column(column.name) for column in _PHOTOGRAMMETRIC), *more], [])
 
-    Of a table ``time_s,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg`` in the local frame.
+
+def _local_poses(table: Table) -> Poses:
+    """The poses of a table, which `_local_table` has read, or of some of its rows.
 
     Raises
     ------
-    UserError : ``file:line: column: what is wrong``, two poses at one time
+    UserError : two poses at one time, fewer than two times
     """
-    notes: list[str] = []
-    header = column_names_of(path)
-    time = time_columns(header)
-    if not time:
-        raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}{separator_hint(header)}")
-    table = read_table(path, [*time, *(Column(column.name) for column in _PHOTOGRAMMETRIC)], notes)
+    path, time, notes = table.path, time_columns(table.values), list[str]()
     time_ns, first, of = np.unique(times_of(table, time, None, notes), return_index=True, return_inverse=True)
     if len(time_ns) < 2:
         raise UserError(f"{path}: {len(time_ns)} poses, wanted at least 2")
@@ -145,7 +159,89 @@ def read_local_poses(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return position[first], R[first], time_ns
 
 
-def _is_photogrammetric(header: Sequence[str]) -> bool:
+@dataclass(frozen=True)
+class PosesOfStrips:
+    """Poses of a table with several strips, or of one flight.
+
+    Attributes
+    ----------
+    path : file
+    rows : of each strip that the column ``strip`` names, in its order; empty where there is no such column, or no name
+    table : all rows
+    poses : of a table or some of its rows
+    """
+
+    path: Path
+    rows: dict[str, Table]
+    table: Table
+    poses: Callable[[Table], Poses]
+
+    def of(self, strip: str | None) -> Poses:
+        """Those of a strip (None: all) in time order.
+
+        Raises
+        ------
+        UserError : ``file:line: column: what is wrong``, the table has not this strip, two poses at one time
+        """
+        if strip is not None and strip not in self.rows:
+            raise UserError(f"{self.path}: strip: no rows of {strip!r}, there are: {', '.join(self.rows)}")
+        rows = self.table if strip is None else self.rows[strip]
+        if len(rows) < 2:
+            raise UserError(f"{self.path}: {len(rows)} poses{f' of strip {strip!r}' * bool(strip)}, wanted at least 2")
+        return self.poses(rows)
+
+
+def read_poses_of_strips(path: Path, frame: LocalFrame) -> PosesOfStrips:
+    """Poses in the local frame of a project, strip by strip where there is a column ``strip``, as in the tables of
+    `triline adjust` and of `write_oriented_lines`.
+
+    Of a table as `read_trajectory_csv` reads it; of a project without a CRS
+    ``time_s,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg`` in its local frame, in any order, where a pose may come twice.
+
+    Raises
+    ------
+    UserError : ``file:line: column: what is wrong``
+    """
+    more = (_STRIP,) if _STRIP.name in column_names_of(path) else ()
+
+    def in_frame(table: Table) -> Poses:
+        track = _track(table, frame.crs, None, [])
+        position = frame.from_geodetic(*track.geodetic.T)
+        return position, R_lc_from_navigation(frame, position, track.rpy), track.time_ns
+
+    if frame.crs == "local":
+        table, poses = _local_table(path, *more), _local_poses
+    else:
+        refuse_missing_grids(frame.crs, path)
+        table, poses = _track_table(path, frame.crs, [], *more), in_frame
+    named = dict.fromkeys(table[_STRIP.name].tolist()) if more else {}
+    return PosesOfStrips(
+        path, {strip: table.part(table[_STRIP.name] == strip) for strip in named if strip}, table, poses
+    )
+
+
+def _header(path: Path) -> tuple[list[str], list[Column]]:
+    """Names of the columns, and those with the time.
+
+    Raises
+    ------
+    UserError : there are none
+    """
+    header = column_names_of(path)
+    time = time_columns(header)
+    if not time:
+        raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}{separator_hint(header)}")
+    return header, time
+
+
+def _sigmas_of(header: Collection[str]) -> tuple[str, ...]:
+    """Names of columns with sigmas, as far as a table has them."""
+    if _is_photogrammetric(header):
+        return _XYZ_OPK
+    return (*_NED, *_RPY) if set(_NED) <= set(header) else tuple(f"{name}_sigma" for name in _NAVIGATION)
+
+
+def _is_photogrammetric(header: Collection[str]) -> bool:
     return all(set(column.names) & set(header) for column in _PHOTOGRAMMETRIC)
 
 

@@ -27,7 +27,7 @@ from triline.nodes.formats.dem import dem_in_frame, read_dem
 from triline.nodes.formats.geotiff import Heights, read_heights, write_heights
 from triline.nodes.formats.height_raster import HeightRaster
 from triline.nodes.formats.projection import missing_grids
-from triline.nodes.formats.trajectory_csv import read_local_poses
+from triline.nodes.formats.trajectory_csv import read_poses_of_strips
 from triline.nodes.node import Message
 from triline.nodes.recording.access import Recording
 from triline.nodes.recording.reader import RecordingReader
@@ -258,6 +258,21 @@ def test_lines_have_the_poses_of_their_own_strip_where_two_are_imaged_at_the_sam
             images.append((image.read(1), image.transform))
     np.testing.assert_array_equal(images[1][0], images[0][0])
     assert images[1][1] == images[0][1]
+    # so it is with tables of the lines: that of both strips was refused, as its times go back
+    images = []
+    for path in (flown, beside):
+        words = ["--trajectory", folder / f"{path.stem}_lines.csv", "--strip", "S1", "--gsd", 8, "--height", 0]
+        told = _rectify(capsys, path, folder / "strip.tif", *words)
+        assert told["strips"]["S1"] > len(alone) - told["pixels_together"] and not told["notes"]
+        with rasterio.open(folder / "strip.tif") as image:
+            images.append((image.read(1), image.transform))
+    np.testing.assert_array_equal(images[1][0], images[0][0])
+    assert images[1][1] == images[0][1]
+    words = ["rectify", str(beside), "-o", str(folder / "x.tif"), "--trajectory", str(folder / "flown_lines.csv")]
+    assert main([*words, "--strip", "S2"]) == 1
+    assert capsys.readouterr().err.endswith("flown_lines.csv: strip: no rows of 'S2', there are: S1\n")
+    assert main([*words, "--gsd", "20", "--height", "0"]) == 0
+    assert "note: flown_lines.csv has no rows of strip S2" in capsys.readouterr().out
 
 
 def test_parameters_of_other_things_than_the_camera_do_not_hide_those_of_the_camera(flown, folder):
@@ -1015,11 +1030,49 @@ def test_poses_of_two_lenses_at_one_time_are_refused(tmp_path):
     head = "time_s,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg"
     path = tmp_path / "poses.csv"
     path.write_text("\n".join([head, *rows, rows[3], ""]))
-    assert len(read_local_poses(path)[2]) == 10
+    frame = LocalFrame(48.0, 11.0, 0.0, "local")
+    assert len(read_poses_of_strips(path, frame).of(None)[2]) == 10
     for other in (
         "100.300000,21.0000,0.5000,1000.0000,0.0,0.0,0.0",
         "100.300000,21.0000,0.0000,1000.0000,0.0,14.0,0.0",
     ):
         path.write_text("\n".join([head, *rows, other, ""]))
         with pytest.raises(UserError, match=r"poses\.csv:12: time_s: 100\.300000 comes twice with two poses"):
-            read_local_poses(path)
+            read_poses_of_strips(path, frame).of(None)
+
+
+def test_a_table_of_two_strips_gives_each_its_own_rows(tmp_path):
+    """In the local frame, too, where all rows counted by their times alone."""
+    start, path = 1_700_000_000_000_000_000, tmp_path / "two.mcap"
+    with RecordingWriter(path) as writer:
+        project = m.Project(name="two", crs="local", origin_latitude=48.0, origin_longitude=11.0)
+        writer.write(Message("configuration/project", start, project, "x"))
+        for strip in ("S1", "S2", "S3"):
+            body = m.Strip(id=strip, first_line_time_ns=start, line_rate_hz=10.0, lines=10)
+            writer.write(Message("configuration/strip", start, body, "x"))
+    table, head = tmp_path / "poses.csv", "strip,time_s,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg"
+    rows = {s: [f"{s},{start // 10**9 + k / 10:.3f},{7.0 * k:.1f},0,{z},0,0,0" for k in range(10)]
+            for s, z in {"S1": 1000, "S2/L2": 1200, "": 900}.items()}  # fmt: skip
+    table.write_text("\n".join([head, *rows["S1"], *rows["S2/L2"], *rows[""], ""]))
+    recording = Recording(path)
+    found = work.OfTable(recording, table, lens="L2")
+    time_s = np.arange(10) / 10 + (start - found.reference_ns) * 1e-9
+    for strip, height in {"S1": 1000.0, "S2": 1200.0}.items():
+        of_strip = found(strip)
+        assert of_strip is not None and of_strip.covers(time_s).all()
+        np.testing.assert_allclose(of_strip.at(time_s)[0][:, 2], height, atol=1e-6)
+    assert found("S3") is None and found.missing == ["S3"]
+    with pytest.raises(UserError, match=r"poses\.csv: strip: no rows of 'S3', there are: S1, S2/L2$"):
+        work.OfTable(recording, table, ["S3"], "L2")
+    table.write_text("\n".join([head, *(row.replace("S1,", "A,") for row in rows["S1"]), ""]))
+    with pytest.raises(UserError, match=r"poses\.csv: strip: A, wanted one of those of .*two\.mcap: S1, S2, S3$"):
+        work.OfTable(recording, table)
+    bad = rows["S2/L2"][3].replace(",0,1200,", ",nothing,1200,")
+    table.write_text("\n".join([head, *rows["S1"], *rows["S2/L2"][:3], bad, ""]))
+    with pytest.raises(UserError, match=r"poses\.csv:15: Y_m: 'nothing' is not a number"):
+        work.OfTable(recording, table)
+    table.write_text(
+        "\n".join([head, *rows["S1"], *rows["S2/L2"], rows["S2/L2"][2].replace(",0,1200,", ",5,1200,"), ""])
+    )
+    with pytest.raises(UserError, match=r"poses\.csv:22: time_s: .* comes twice with two poses"):
+        work.OfTable(recording, table, lens="L2")
