@@ -20,6 +20,7 @@ from .. import convert
 from ..governor import Announced, Governor
 from ..node import Message, Node
 from .found_strips import FoundStrips
+from .moving_poses import MovingPoses
 from .pace import PARTS, WINDOW_S, MatcherPace
 from .side_by_side import SideBySide
 from .strip_clock import StripClock
@@ -133,6 +134,7 @@ class Matcher(Node):
         self._reference_ns = 0
         self._stamp_ns = self._told_ns = 0
         self._filtered_seen = False
+        self._moving = MovingPoses()
 
     def step(self, message: Message) -> Iterable[Message]:
         if message.source == self.name and message.topic == "configuration/strip":
@@ -204,7 +206,7 @@ class Matcher(Node):
         elif topic.startswith("sensor/lines/"):
             return self._lines(topic.rpartition("/")[2], body)
         elif topic.startswith("trajectory/"):
-            self._pose(body, topic == "trajectory/smoothed")
+            return self._pose(body, topic == "trajectory/smoothed")
         elif topic == "orientation/live":
             self._correction(body)
         elif topic == "adjustment/report" and self._matcher is not None:
@@ -238,6 +240,7 @@ class Matcher(Node):
         if another_frame:
             self._heights.clear()  # they have to be stated again in the new frame, and poses so far are not in it
             self._targets.forget()
+            self._moving.begin()
         elif self._mounting[0] == mounted[0]:
             return []
         return [] if self._camera is None else self._begin(self._camera, stamp_ns)
@@ -318,20 +321,29 @@ class Matcher(Node):
             "local frame: if it is not, give ground_m in [matcher]"
         ]
 
-    def _pose(self, body: Any, smoothed: bool) -> None:
+    def _pose(self, body: Any, smoothed: bool) -> list[Message]:
         self._filtered_seen |= not smoothed
         # without a filter (an imported trajectory) the smoothed poses lead
         if self._matcher is None or (smoothed and self._filtered_seen):
-            return
-        sample = convert.pose_sample(body)
+            return []
+        sample, out = convert.pose_sample(body), list[Message]()
         if sample.covariance is None:
             raise ValueError("pose without covariance")
+        if not smoothed:
+            if not self._moving.takes(sample):
+                self.counters["poses without motion"] += 1
+                return []
+            if self._moving.left_out and self._matcher.strip:
+                n, why = self._moving.left_out, "the navigator did not know how fast it flies"
+                out = [self._log(f"{self._matcher.strip}: {n} poses are left out: {why}", warning=True)]
+            self._moving.left_out = 0
         time_s = (sample.time_ns - self._reference_ns) * 1e-9
         turns, quaternion = self._mounting[0], sample.quaternion
         if turns:
             quaternion = quaternion_multiply(quaternion, _BACK[turns])
         if not self._matcher.add_pose(time_s, sample.position_l, quaternion, sample.covariance):
             self.problem("pose out of order", f"pose of {time_s:.3f} s came twice or too late")
+        return out
 
     def _correction(self, body: Any) -> None:
         orientation = None if self._matcher is None else self._matcher.orientation_of(body.strip)
