@@ -331,7 +331,7 @@ class Matcher(Node):
             raise ValueError("pose without covariance")
         if not smoothed:
             if not self._moving.takes(sample):
-                self.counters["poses without motion"] += 1
+                self.counters["poses without motion"] += bool(self._matcher.strip)  # before a strip nobody misses them
                 return []
             if self._moving.left_out and self._matcher.strip:
                 n, why = self._moving.left_out, "the navigator did not know how fast it flies"

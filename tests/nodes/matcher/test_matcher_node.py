@@ -421,7 +421,7 @@ def test_in_another_local_frame_matching_begins_again(tmp_path, low):
     begun = told.index("configuration changed: matching starts again")
     assert sum("S1: 10 poses are left out: the navigator did not know" in text for text in told[begun:]) == 1
     assert not [text for text in told[begun:] if "S1: target" in text], told
-    assert counted["poses without motion"] == 20 and not counted.get("malformed")
+    assert counted["poses without motion"] == 10 and not counted.get("malformed")
     assert sum(not tie.point.startswith("S1-M") for tie in ties) > 10 and counted["target measured"] > 20
     looks = [x for x in RecordingReader(tmp_path / "out.mcap").messages(["observation/target"])]
     seen = {x.body.point for x in looks if x.stamp_ns > more[0].stamp_ns + 10**9}
