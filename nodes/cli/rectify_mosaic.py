@@ -63,7 +63,10 @@ FIRST_UTC_S = 2 * 365 * 86400
 #: Ends of the names of recordings; everything else is an image.
 _RECORDINGS = (".mcap",)
 #: Options of images and recordings that a mosaic of several does not take.
-_NOT_OF_MOSAIC = ("trajectory", "control", "correction", "first_pixel", "mask", "bounds", "direct", "plain")
+_NOT_OF_MOSAIC = {
+    "trajectory": "recording",
+    **dict.fromkeys(("control", "correction", "first_pixel", "mask", "bounds", "direct", "plain"), "image"),
+}
 
 #: Options without effect where the inputs have no image with its metadata, no recording, or neither of them.
 _OF_IMAGES = ("model", "dem_datum", "nodata", "position_sigma", "attitude_sigma")
@@ -173,11 +176,10 @@ def _check(args: argparse.Namespace, outputs: Outputs) -> None:
                 )
     if len({str(p.resolve()) for p in named}) < len(named):
         raise UserError("-o, --sigma, --source, --seam-lines, --stac: wanted different files")
-    for name in _NOT_OF_MOSAIC:
+    for name, of in _NOT_OF_MOSAIC.items():
         if rectify_image.is_given(args, name):
             raise UserError(
-                f"--{name.replace('_', '-')}: is of one image or recording; wanted orthoimages made with it, then "
-                "--mosaic of these"
+                f"--{name.replace('_', '-')}: is of one {of}; wanted orthoimages made with it, then --mosaic of these"
             )
     tile = TILE if args.tile is None else args.tile
     if args.tile is not None and (tile < LEAST_TILE or tile & (tile - 1)):
@@ -545,6 +547,10 @@ def _tell(result: dict[str, Any], args: argparse.Namespace) -> None:
             print(f"  left out of {layer['name']}: {lines} lines {why}")
         if layer.get("poses_not_valid"):
             print(f"  {layer['name']}: {layer['poses_not_valid']} poses are not valid and give no orientation")
+        if layer.get("missed_rays"):
+            print(f"  {layer['name']}: {layer['missed_rays']} rays did not meet the ground")
+        if layer.get("hidden_cells") is not None:
+            print(f"  {layer['name']}: {layer['hidden_cells']} cells hidden by relief")
     if not args.quiet:
         for note in result["notes"]:
             print(f"  note: {note}")

@@ -492,6 +492,8 @@ def test_virtual_mosaics_have_their_axes_as_gdal_writes_them(crs, tmp_path):
         (["--crs", "EPSG:32633"], "is not in EPSG:32633"),
         (["--control", "c.csv"], "--control: is of one image"),
         (["--correction", "shift"], "--correction: is of one image"),
+        (["--mask", "m.tif"], "--mask: is of one image; wanted orthoimages made with it, then --mosaic of these"),
+        (["--trajectory", "lines.csv"], "--trajectory: is of one recording; wanted orthoimages made with it"),
         (["--tile", "0"], "--tile 0: wanted a power of two of at least 128"),
         (["--sensor", "one.geom"], "--sensor: 1 for 3 images"),
         (["--nodata", "255"], "--nodata: goes with an image and its --sensor, and there is none"),

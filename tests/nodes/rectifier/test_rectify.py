@@ -421,8 +421,13 @@ def test_cells_behind_walls_are_left_out(flown, simulated, dem, folder, capsys):
     off = np.abs(whole[some] - grey)[~hidden & ~edge[some]]
     assert np.median(off) < 1.0 and (off > 0.1 * lines.std()).mean() < 0.05  # 2.7 and 0.15 with those of smooth ground
     # in a mosaic they stay empty, too, where no other strip sees them
-    block = _rectify(capsys, flown, folder / "block.tif", *options, "--occlusions", "--mosaic", "--workers", "1")
+    options = (*options, "--occlusions", "--mosaic", "--workers", "1", "--keep")
+    block = _rectify(capsys, flown, folder / "block.tif", *options)
     assert block["layers"][0]["hidden_cells"] == told["hidden_cells"]
+    assert main(["rectify", str(flown), "-o", str(folder / "block.tif"), *map(str, options)]) == 0
+    words = capsys.readouterr().out
+    assert f"S1: {told['hidden_cells']} cells hidden by relief" in words
+    assert f"S1: {block['layers'][0]['missed_rays']} rays did not meet the ground" in words or not told["missed_rays"]
     assert ((cells("block.tif")[0] == 0) == left_out).all()
 
 
