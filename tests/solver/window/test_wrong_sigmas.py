@@ -37,12 +37,16 @@ from triline.solver.window.state.unknowns import WindowState
 
 SLOW = SlowErrors((0.3, 0.3, 0.5), (1e-4, 1e-4, 2e-4), (5e-5,) * 3, (0.1, 0.1, 0.2), (4e-5,) * 3, 30.0)
 OPTIONS = WindowOptions(grid_hz=4.0)
+#: As those of the study, with half as many measurements of the attitude.
+RTK, DEF = (replace(SETTINGS[name], attitude_rate_hz=100.0) for name in ("rtk", "def"))
+PLAN = FlightPlan(strip_s=40.0, lead_in_s=3.0, lead_out_s=2.0)
 
 
 @cache
 def measured(row: str, strip_s: float = 40.0, seed: int = 4):
     """A flight with carrier-phase GNSS in a world of the study, and its poses as navigated."""
-    simulation = simulate(FlightPlan(strip_s=strip_s), seed, SETTINGS["rtk"], OBSERVED, world=ROWS[row].world)
+    plan, sensors = (FlightPlan(), SETTINGS["rtk"]) if row == "sine-fast" else (PLAN, RTK)
+    simulation = simulate(replace(plan, strip_s=strip_s), seed, sensors, OBSERVED, world=ROWS[row].world)
     return simulation, navigate(simulation)
 
 
@@ -50,7 +54,7 @@ def measured(row: str, strip_s: float = 40.0, seed: int = 4):
 def flown(row: str, strip_s: float = 40.0, seed: int = 4):
     """Such a flight through the window."""
     simulation, poses = measured(row, strip_s, seed)
-    return simulation, adjust_online(simulation, poses, OPTIONS, live=False, update_s=0.5)
+    return simulation, adjust_online(simulation, poses, OPTIONS, live=False, update_s=1.0)
 
 
 def rejected(online) -> int:
@@ -105,7 +109,7 @@ def with_focal_length(row: str, seed: int = 4):
     """The same with the focal length as an unknown, as the adjuster has it by default."""
     simulation, poses = measured(row, seed=seed)
     parameters = focal_length(simulation.flight.camera)
-    online = adjust_online(simulation, poses, OPTIONS, parameters, live=False, update_s=0.5)
+    online = adjust_online(simulation, poses, OPTIONS, parameters, live=False, update_s=1.0)
     return simulation, online
 
 
@@ -146,8 +150,8 @@ def test_heavy_tails_are_told_and_cost_no_control():
 
 def test_mismatches_are_no_heavy_tails():
     plan = replace(OBSERVED, outlier_share=0.08)
-    simulation = simulate(FlightPlan(strip_s=40.0), 4, SETTINGS["rtk"], plan)
-    online = adjust_online(simulation, navigate(simulation), OPTIONS, live=False, update_s=0.5)
+    simulation = simulate(PLAN, 4, RTK, plan)
+    online = adjust_online(simulation, navigate(simulation), OPTIONS, live=False, update_s=1.0)
     assert rejected(online) > 0.05 * len(simulation.images)
     assert online.window.network.tails.share(online.window.network.batches) < HEAVY_TAILS
     assert online.reports[-1].quality.light == GOOD
@@ -309,12 +313,10 @@ def test_gross_errors_of_a_strip_that_begins_are_not_taken_for_sigmas(seed):
     """Its points have two looks at first, of which none can be spared. Sigmas of the image became twenty times as
     large, tests of single looks as much wider, and the orientation was twice as bad to the end of the strip."""
     plan = ObservationPlan(tie_points_per_s=8.0, check=10, outlier_share=0.2)
-    simulation = simulate(
-        FlightPlan(strip_s=40.0, lead_in_s=3.0, lead_out_s=2.0), seed, ErrorModel(attitude_rate_hz=100.0), plan
-    )
+    simulation = simulate(PLAN, seed, ErrorModel(attitude_rate_hz=100.0), plan)
     poses = navigate(simulation)
     clean = replace(simulation, images=simulation.images.select(~simulation.images.outlier))
-    with_errors, without = (adjust_online(s, poses, OPTIONS, live=False, update_s=0.5) for s in (simulation, clean))
+    with_errors, without = (adjust_online(s, poses, OPTIONS, live=False, update_s=1.0) for s in (simulation, clean))
     assert with_errors.window.network.sigmas.image == 1.0
     worse, rms = (np.linalg.norm(orientation_errors(simulation, of.whole).rmse[:3]) for of in (with_errors, without))
     assert worse < 1.15 * rms
@@ -447,9 +449,9 @@ def camera_network() -> LiveNetwork:
 
 def test_a_wander_of_the_attitude_that_is_faster_is_stated_apart():
     """GNSS wanders over a minute, attitude over six seconds; one time for both has to be the shorter one."""
-    true = replace(SETTINGS["def"], wander_time_s=60.0, attitude_wander_time_s=6.0)
+    true = replace(DEF, wander_time_s=60.0, attitude_wander_time_s=6.0)
     alike = replace(true, wander_time_s=6.0, attitude_wander_time_s=0.0)
-    flights = [simulate(FlightPlan(strip_s=25.0), seed, true, OBSERVED) for seed in (1, 2)]
+    flights = [simulate(replace(PLAN, strip_s=25.0), seed, true, OBSERVED) for seed in (1, 2)]
     found = []
     for told in (true, alike):
         squares = []
