@@ -96,9 +96,10 @@ class Snooping:
 
 
 @cache
-def joint_limit(critical: float) -> float:
-    """Limit of the joint test value of line and sample with the same error probability as one |w| (13.8 for 3.29)."""
-    return float(chi2.isf(2.0 * norm.sf(critical), 2))
+def joint_limit(critical: float, values: int = 2) -> float:
+    """Limit of the joint test value of line and sample, or of other numbers of values, with the same error probability
+    as one |w| (13.8 for 3.29)."""
+    return float(chi2.isf(2.0 * norm.sf(critical), values))
 
 
 def failing_w(largest_w: Array, joint: Array, critical: float) -> Array:

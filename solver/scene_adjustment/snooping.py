@@ -6,6 +6,8 @@ image points fit; where all image points of a point went, three or more, and agr
 coordinates go in their place: grossly wrong ones bend the block so much that these fail first. It is the same with a
 tie point that lost so many that it has no place any more. Where too many image points would go, model or sigmas are
 wrong, and nothing is left out.
+
+Where the image points do not fit, the block without any control says whether control bends it (`bending_control`).
 """
 
 from __future__ import annotations
@@ -27,7 +29,17 @@ from ..adjustment.snooping import (
     joint_limit,
     largest_of_group,
 )
-from .solution import MOST_ITERATIONS, SceneSolution, State, adjust, intersect, linearise
+from .solution import (
+    MOST_ITERATIONS,
+    NotAdjustableError,
+    SceneSolution,
+    State,
+    adjust,
+    intersect,
+    joint_covariance,
+    linearise,
+    points_enu,
+)
 
 Array = NDArray[np.floating]
 
@@ -78,6 +90,18 @@ def snoop(
     returned_given: set[tuple[int, int]] = set()
     exchanged: set[int] = set()
     rounds, w_then, taken = 0, np.zeros(len(point)), solution.iterations
+    if given.any() and not (solution.converged and _scale(solution) <= CONTROL_FIT):
+        straight = _without_control(solution, critical, max_iterations)
+        if straight is not None:
+            taken += straight.solution.iterations
+            bending = bending_control(straight.solution, given, critical)
+            if bending.any():
+                use[straight.rays], w_then[straight.rays] = False, straight.w
+                few = np.bincount(point, use, len(given)) < 3  # nothing tells whether two rays are wrong or it
+                use[np.isin(point, np.flatnonzero(few & bending.any(axis=1)))] = False
+                given &= few[:, None] | ~bending
+                solution = adjust(solution.problem, straight.solution.state, use, given, max_iterations)
+                taken += solution.iterations
     for rounds in range(1, MOST_ROUNDS + 1):
         before = use.copy(), given.copy()
         _leave_out(solution, critical, use, given)
@@ -111,16 +135,70 @@ def _larger(test: Array) -> Array:
     return np.take_along_axis(test, np.abs(test).argmax(axis=1)[:, None], axis=1)[:, 0]
 
 
+def _scale(solution: SceneSolution) -> float:
+    """How many of their sigmas the residuals of image points have, by their median."""
+    w = np.abs(solution.test[solution.ray_weight])
+    return float(np.median(w[w > 0])) / 0.6745 if (w > 0).any() else 1.0
+
+
+def _without_control(solution: SceneSolution, critical: float, max_iterations: int) -> SceneSnooping | None:
+    """The block by image points and a-priori knowledge alone; None where these do not determine it, or do not fit."""
+    problem = replace(solution.problem, given=np.zeros_like(solution.given))
+    try:
+        alone = adjust(problem, max_iterations=max_iterations)
+    except NotAdjustableError:
+        return None
+    if not alone.converged or alone.undetermined or _scale(alone) > CONTROL_FIT:
+        return None
+    found = snoop(alone, critical, max_iterations)
+    return None if found.given_up or not found.solution.converged else found
+
+
+def bending_control(solution: SceneSolution, given: NDArray[np.bool_], critical: float) -> NDArray[np.bool_]:
+    """Which known coordinates (p, 3) contradict the block without control, and each other.
+
+    What control says against points that are adjusted without it, ``l`` with the covariance ``S`` of both, are
+    condition equations: their normalised residuals are ``(S^-1 l) / sqrt(diag S^-1)``, the squares of all
+    ``l' S^-1 l``. The worst goes, and so on until no other fails clearly and together they do not fail. Nothing bends
+    the block meanwhile, however far off control lies. Where more than half of the control points would go, model or
+    a-priori knowledge contradicts them, and none does.
+
+    Parameters
+    ----------
+    solution : the block without control
+    given : (p, 3) known coordinates that are asked about
+    critical : of ``|w|``
+    """
+    problem, known = solution.problem, solution.problem.block.known
+    out = np.zeros_like(given)
+    of = np.flatnonzero(given[known.point].any(axis=1) & solution.determined[known.point])
+    points = known.point[of]
+    miss = points_enu(problem, solution.state.position_e, known.position_e[of], points).ravel()
+    S = joint_covariance(solution, points) * max(_scale(solution), 1.0) ** 2
+    k = np.arange(len(points))
+    S.reshape(len(points), 3, len(points), 3)[k, :, k, :] += problem.covariance_enu[points]
+    left = np.flatnonzero(given[points].ravel())
+    while len(left):
+        weight = np.linalg.inv(S[np.ix_(left, left)])
+        v = weight @ miss[left]
+        w = np.abs(v) / np.sqrt(np.diag(weight))
+        if w.max() <= CONTROL_CLEAR * critical and miss[left] @ v <= joint_limit(critical, len(left)):
+            break
+        worst = int(w.argmax())
+        out[points[left[worst] // 3], left[worst] % 3] = True
+        left = np.delete(left, worst)
+    if out.any(axis=1).sum() > len(points) / 2:
+        out[:] = False
+    return out
+
+
 def _leave_out(solution: SceneSolution, critical: float, use: NDArray[np.bool_], given: NDArray[np.bool_]) -> None:
     """Take out of the masks what fails most."""
     point = solution.problem.block.rays.point
     largest = np.abs(solution.test).max(axis=1, initial=0.0)
     w = np.where(solution.ray_weight, failing_w(largest, solution.joint, critical), 0.0)
     w_given = np.abs(solution.given_test) * given
-    usual = largest[solution.ray_weight & (largest > 0)]
-    one = np.abs(solution.test[solution.ray_weight])
-    scale = float(np.median(one[one > 0])) / 0.6745 if len(usual) else 1.0
-    if scale > CONTROL_FIT:
+    if _scale(solution) > CONTROL_FIT:
         w_given = np.zeros_like(w_given)
     worst = max(float(w.max(initial=0.0)), float(w_given.max(initial=0.0)))
     limit = max(critical, TOGETHER * worst)

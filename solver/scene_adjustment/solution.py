@@ -526,6 +526,17 @@ def _words(null: Array, names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(words)
 
 
+def joint_covariance(solution: SceneSolution, points: Indices) -> Array:
+    """Covariance (3 k, 3 k) of adjusted points (k,), each in its own east, north, up; m2, for sigma0 = 1."""
+    normals = linearise(solution.problem, solution.state, solution.ray_weight, solution.given)
+    reduced = _reduce(normals)
+    F = (normals.N_tp[points] @ reduced.inverse_pp[points]).transpose(0, 2, 1).reshape(-1, len(normals.N_tt))
+    covariance = F @ reduced.Q_t @ F.T
+    own = np.arange(len(points))
+    covariance.reshape(len(points), 3, len(points), 3)[own, :, own, :] += reduced.inverse_pp[points]
+    return covariance
+
+
 def points_enu(problem: Problem, position_e: Array, reference_e: Array, points: Indices) -> Array:
     """Differences (k, 3) in metres, east, north, up, of positions (p, 3) from references (k, 3) of points (k,)."""
     return np.einsum("pji,pj->pi", problem.R_e_enu[points], position_e[points] - reference_e)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from triline.solver.adjustment.reliability import CRITICAL_W
 from triline.solver.camera.self_calibration import lens, prism
 from triline.solver.geometry.ellipsoid import WGS84
 from triline.solver.location.rpc_fit import fit_to_model
@@ -15,7 +16,7 @@ from triline.solver.models.dgr import DgrOptions
 from triline.solver.scene_adjustment.block import GIVEN, KnownGround, SceneBlock
 from triline.solver.scene_adjustment.functional import ProjectiveImage, RpcImage
 from triline.solver.scene_adjustment.single_looks import single_looks
-from triline.solver.scene_adjustment.snooping import snoop
+from triline.solver.scene_adjustment.snooping import bending_control, snoop
 from triline.solver.scene_adjustment.solution import NotAdjustableError, adjust, points_enu, prepare
 from triline.solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass
 from triline.solver.simulation.satellite_block import rigorous_images, scattered_points, simulate_block
@@ -250,33 +251,67 @@ def test_gross_errors_are_found_and_named():
     )
 
 
-@pytest.mark.parametrize(("sensor", "exchanged"), [("alos-prism", True), ("spot5-hrs", False)])
-def test_control_that_is_degrees_off_leaves_the_block_as_it_is_without_it(sensor, exchanged):
+def with_control_off(block, place, off_deg):
+    """A block whose control point at a place of `KnownGround` is given so far north of where it is."""
+    lat, lon, height = WGS84.geodetic(block.known.position_e[place : place + 1])[0]
+    position = block.known.position_e.copy()
+    position[place] = WGS84.cartesian(lat + np.radians(off_deg), lon, height)
+    return replace(block, known=replace(block.known, position_e=position))
+
+
+@pytest.mark.parametrize(("sensor", "points", "named"), [("alos-prism", 30, True), ("spot5-hrs", 15, False)])
+def test_control_that_is_degrees_off_leaves_the_block_as_it_is_without_it(sensor, points, named):
     """A block that it bent did not find back: rays beyond the orbit, normal equations of points without a root, points
-    that were lost for good; and all image points of the control went, not its coordinates, where three of them agree.
+    that were lost for good, image points of which more than a third failed; and all image points of the control went,
+    not its coordinates, where three of them agree.
     """
-    simulation = simulated(sensor, points=60, seed=8)
+    simulation = simulated(sensor, points=points, seed=8)
     block = simulation.block
-    for place in range(2):
-        lat, lon, height = WGS84.geodetic(block.known.position_e[place : place + 1])[0]
-        for off_deg in (-1.0, 1.0):
-            position = block.known.position_e.copy()
-            position[place] = WGS84.cartesian(lat + np.radians(off_deg), lon, height)
-            typed = replace(block, known=replace(block.known, position_e=position))
-            found = snoop(adjust(prepare(typed)))
-            point = block.known.point[place]
-            own = np.flatnonzero(block.rays.point == point)
-            kept = found.solution
-            if exchanged:
-                assert {p for p, _ in found.coordinates} == {point} and not set(own) & set(found.rays)
-                assert np.linalg.norm(misses(kept, simulation)[point]) < 20.0
-            else:
-                assert set(own) <= set(found.rays)  # nothing tells whether two rays are wrong or it
-            assert kept.determined.all() and kept.converged and 0.8 < kept.sigma0 < 1.2
-            assert len(set(found.rays) - set(own)) < 0.07 * len(block.rays)
-            other = np.flatnonzero(np.arange(len(block.point_ids)) != point)
-            sigma = kept.sigma0 * np.sqrt(np.einsum("pii->pi", kept.points_covariance[other]))
-            assert np.sqrt(np.mean(np.square(misses(kept, simulation)[other] / sigma))) < 1.6
+    for place, off_deg in ((0, -1.0), (1, 1.0)):
+        found = snoop(adjust(prepare(with_control_off(block, place, off_deg))))
+        point = block.known.point[place]
+        own = np.flatnonzero(block.rays.point == point)
+        kept = found.solution
+        if named:
+            assert {p for p, _ in found.coordinates} == {point} and not set(own) & set(found.rays)
+            assert np.linalg.norm(misses(kept, simulation)[point]) < 20.0
+        else:
+            assert set(own) <= set(found.rays)  # nothing tells whether two rays are wrong or it
+        assert kept.determined.all() and kept.converged and 0.8 < kept.sigma0 < 1.2
+        assert len(set(found.rays) - set(own)) < 0.07 * len(block.rays)
+        other = np.flatnonzero(np.arange(len(block.point_ids)) != point)
+        sigma = kept.sigma0 * np.sqrt(np.einsum("pii->pi", kept.points_covariance[other]))
+        assert np.sqrt(np.mean(np.square(misses(kept, simulation)[other] / sigma))) < 1.6
+
+
+def test_control_that_is_off_among_image_points_that_are_off_is_named_and_its_image_points_stay():
+    """Without control the block does not fit either; what went of the image points of control is exchanged for it."""
+    simulation = simulated(points=20, seed=100)
+    block, rng = simulation.block, np.random.default_rng(0)
+    wrong = np.sort(rng.choice(np.flatnonzero(block.rays.point >= 12), 4, replace=False))
+    sample = block.rays.sample.copy()
+    sample[wrong] += rng.choice([-1.0, 1.0], 4) * rng.uniform(5.0, 40.0, 4)
+    block = with_control_off(replace(block, rays=replace(block.rays, sample=sample)), 0, 0.3)
+    found = snoop(adjust(prepare(block)))
+    point = block.known.point[0]
+    assert {p for p, _ in found.coordinates} == {point} and len(found.rays) == 4
+    assert set(block.rays.point[found.rays]) == set(block.rays.point[wrong])  # along the track any of three may be it
+    assert found.solution.converged and 0.8 < found.solution.sigma0 < 1.2
+
+
+def test_where_all_control_contradicts_the_orbit_none_of_it_is_left_out_for_that():
+    """Control agrees with itself, 100 m from where a-priori knowledge has it: nothing tells which is wrong."""
+    tight = DgrOptions((0.1,) * 3, (1e-6,) * 3, (1e-7,) * 3)
+    block = simulated(points=12, model=tight, seed=100).block
+
+    def found(block):
+        problem = prepare(block)
+        return bending_control(adjust(problem, given=np.zeros((12, 3), dtype=bool)), problem.given, CRITICAL_W)
+
+    assert {p for p, _ in np.argwhere(found(with_control_off(block, 0, 0.001)))} == {block.known.point[0]}
+    for place in range(6):
+        block = with_control_off(block, place, 0.001)
+    assert not found(block).any()
 
 
 def test_snooping_gives_up_where_sigmas_are_wrong():
