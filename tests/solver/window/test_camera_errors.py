@@ -52,7 +52,7 @@ def flown(share: float, known: str = "calibrated", row: str = "stated", seed: in
     simulation, poses = measured(share, row, seed)
     parameters = left_by_calibration(PLAN.camera) if known == "calibrated" else focal_length(PLAN.camera)
     online = adjust_online(
-        simulation, poses, OPTIONS, parameters, live=False, update_s=0.5, platform=PlatformErrors(1e-3)
+        simulation, poses, OPTIONS, parameters, live=False, update_s=1.0, platform=PlatformErrors(1e-3)
     )
     return simulation, online
 
