@@ -181,7 +181,7 @@ def flight():
     return simulation, navigate(simulation)
 
 
-def spoilt(flight, by, datum="control", live=False):
+def spoilt(flight, by, datum="control", live=False, update_s=1.0):
     """A flight whose control is off by so many metres in height, by place in the order in which it is flown over."""
     simulation, poses = flight
     control = np.flatnonzero(simulation.points.role == "control")
@@ -191,7 +191,7 @@ def spoilt(flight, by, datum="control", live=False):
     for place, metres in by.items():
         surveyed[control[place], 2] += metres
     options = WindowOptions(grid_hz=4.0, datum=datum)
-    online = adjust_online(replace(simulation, surveyed_l=surveyed), poses, options, live=live, update_s=0.5)
+    online = adjust_online(replace(simulation, surveyed_l=surveyed), poses, options, live=live, update_s=update_s)
     return online, [str(simulation.points.id[i]) for i in control]
 
 
@@ -200,7 +200,7 @@ def beyond(errors, sigmas=4.5):
 
 
 def test_control_in_another_height_system_is_named_and_its_datum_published(flight):
-    online, _ = spoilt(flight, dict.fromkeys(range(6), 47.0))
+    online, _ = spoilt(flight, dict.fromkeys(range(6), 47.0), update_s=0.5)
     out = set()
     for r in online.refused:
         if r.coordinate:
