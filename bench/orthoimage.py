@@ -158,7 +158,7 @@ def straightness(seed: int, folder: Path) -> dict[str, tuple[float, float, float
     result = {}
     for name in ("measured", "live", "final", "truth"):
         _, orientation, reference_ns = work.orientation_of(recording, name)
-        job = work.Rectification(camera, ccd, field, grid, "bilinear", work.always(orientation), reference_ns)
+        job = work.Rectification(camera, ccd, field, grid, "bilinear", lambda _, it=orientation: it, reference_ns)
         for block in work.line_blocks(recording, "N", None):
             job.add(block)
         done = job.finish()

@@ -105,11 +105,6 @@ class OfStrips:
         return _own(self._tables[topic], strip)
 
 
-def always(orientation: LineOrientation) -> Callable[[str], LineOrientation]:
-    """One orientation for all strips."""
-    return lambda strip: orientation
-
-
 def strips_beside(recording: Recording) -> set[str]:
     """The strips that are imaged while another one is, as by two cameras with line rates of their own."""
     spans = []
