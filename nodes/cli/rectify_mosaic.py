@@ -144,7 +144,10 @@ def run(args: argparse.Namespace) -> int:
     if not args.keep and not outputs.need_tiles:
         remove_parts(folder)
     result["seconds"] = round(time.perf_counter() - begun, 3)
-    _tell(result, args)
+    if args.json:
+        print(json_text(result))
+    else:
+        tell(result, args.quiet)
     for path in [path for kind, path, _ in kinds if kind == "recording"]:
         reader = RecordingReader(path)
         tell_other_frame("rectify", reader)
@@ -502,10 +505,8 @@ def _result(
     }  # fmt: skip
 
 
-def _tell(result: dict[str, Any], args: argparse.Namespace) -> None:
-    if args.json:
-        print(json_text(result))
-        return
+def tell(result: dict[str, Any], quiet: bool) -> None:
+    """Print a result in words, without its notes where `quiet`."""
     again = f", {result['continued']} jobs were done already" if result["continued"] else ""
     cells = f"{result['rows']} x {result['columns']} cells of {result['gsd']:g} {unit_of(result['crs'])}"
     layers = f"{len(result['layers'])} layers"
@@ -551,7 +552,7 @@ def _tell(result: dict[str, Any], args: argparse.Namespace) -> None:
             print(f"  {layer['name']}: {layer['missed_rays']} rays did not meet the ground")
         if layer.get("hidden_cells") is not None:
             print(f"  {layer['name']}: {layer['hidden_cells']} cells hidden by relief")
-    if not args.quiet:
+    if not quiet:
         for note in result["notes"]:
             print(f"  note: {note}")
     for name in result["empty"]:
