@@ -71,8 +71,7 @@ class Arrivals:
         if self._snoop:
             network.state.expect([batch.columns for batch in fresh])
             equations = [EntryEquations.of(batch, network.state) for batch in fresh]
-            for of_batch in equations:
-                self._newest.entered(disagreement(of_batch))
+            self._newest.entered(point for of_batch in equations for point in disagreement(of_batch))
             for batch, of_batch in zip(fresh, equations, strict=True):
                 update.refused += admit(batch, of_batch, network)
                 set_apart(batch, contradicting(batch, network.state, ON_ENTRY), network, update)

@@ -9,7 +9,6 @@ spared; they count until there are others.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable
 from statistics import median
 
@@ -19,9 +18,9 @@ from ...arrays import Array
 from ...quantiles import chi2, median_square
 from ..state.sigma_factors import SigmaFactors
 
-#: Points whose disagreement is remembered, those wanted to say anything, the variance ratio where all is right (the
-#: median of chi-square values of one degree of freedom that are the least of three), and that from which it counts.
-#: Tuned.
+#: Points whose disagreement is remembered, if no more come at once, those wanted to say anything, the variance ratio
+#: where all is right (the median of chi-square values of one degree of freedom that are the least of three), and that
+#: from which it counts. Tuned.
 REMEMBERED, ENOUGH, RIGHT, CLEARLY = 60, 15, 0.3, 1.5
 #: Disagreements of two looks beyond so many standard deviations may be gross errors, and this share of them is taken
 #: for good: usual, and tuned, for points of which a third are spoilt. Rounds that find out.
@@ -40,8 +39,8 @@ class Disagreement:
 
     def __init__(self, sigmas: SigmaFactors) -> None:
         self._sigmas = sigmas
-        self._ratios: deque[float] = deque(maxlen=REMEMBERED)
-        self._of_two: deque[float] = deque(maxlen=REMEMBERED)
+        self._ratios: list[float] = []
+        self._of_two: list[float] = []
         self.enough = False
 
     @property
@@ -50,12 +49,18 @@ class Disagreement:
         return not self.enough or self._sigmas.disagreement > 1.0
 
     def entered(self, squares: Iterable[tuple[float, int, bool]]) -> None:
-        """Points have come, each as `entry.disagreement` judges it. Those of two looks count until enough have more."""
+        """Points have come, each as `entry.disagreement` judges it. Those of two looks count until enough have more.
+
+        All that come at once count: the last 60 of some hundred would have one orientation and its error in common.
+        """
+        ratios, of_two = [], []
         for square, redundancy, spared in squares:
             if spared:
-                self._ratios.append(square / median_square(redundancy))
+                ratios.append(square / median_square(redundancy))
             else:
-                self._of_two.append(square)
+                of_two.append(square)
+        self._ratios = (self._ratios + ratios)[-max(REMEMBERED, len(ratios)) :]
+        self._of_two = (self._of_two + of_two)[-max(REMEMBERED, len(of_two)) :]
         self.enough, ratio = True, RIGHT
         if len(self._ratios) >= ENOUGH:
             ratio = median(self._ratios)  # NumPy's takes fifty times as long for so few

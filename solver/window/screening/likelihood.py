@@ -20,6 +20,8 @@ from ..state.unknowns import WindowState, block_of
 
 #: Factors that are weighed against each other, and how far from 1 they usually are, as a logarithm. Tuned.
 BANK, USUAL_LOG = (1.0, 1.5, 2.3, 3.5, 5.5, 9.0, 15.0, 30.0, 60.0), 1.5
+#: How far those of a strip usually are from what earlier strips have shown, as a logarithm. Tuned.
+FROM_STRIP_TO_STRIP_LOG = 0.4
 #: Before a wander is stated larger it is weighed against noise of looks that is so many times as large. Tuned.
 NOISES = (1.0, 1.2, 1.45, 1.75, 2.1, 2.6, 3.2, 4.0, 5.0)
 #: The steps from a choice of factors to its neighbours.
@@ -27,9 +29,10 @@ STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 #: Neighbours are weighed of factors whose cost is so far above the least: their weight is below 1e-4. Derived.
 COUNTS = 20.0
 #: Wanders are weighed where twice as large a one is more likely by so much, as minus twice the logarithm of a
-#: likelihood ratio: chi-square of two degrees of freedom, 0.5 %. Tuned: between 6 and 18 flights as stated are the
-#: same, and points of flights whose wander is twice as large and seen by few looks are within 3 %.
-CLEARLY_LIKELIER = 10.6
+#: likelihood ratio: chi-square of two degrees of freedom, 0.05 %. It is asked over and over: with 0.5 % a strip as
+#: stated of 4 minutes is doubted now and then. Tuned: between 6 and 18 short flights as stated are the same, and points
+#: of flights whose wander is twice as large and seen by few looks are within 3 %.
+CLEARLY_LIKELIER = 15.0
 #: Factors on position and attitude that are tried for that.
 TWICE = ((1.0, 2.0), (2.0, 1.0), (2.0, 2.0))
 #: By what they are tried to be larger where another explanation is weighed against them. Tuned.
@@ -57,6 +60,32 @@ class LookNoise:
     rhs: Array
 
 
+@dataclass(frozen=True)
+class Beforehand:
+    """What is known of the factors on position and attitude before the data: their logarithms have a normal
+    distribution of this mean and sigma."""
+
+    mean: tuple[float, float] = (0.0, 0.0)
+    sigma: tuple[float, float] = (USUAL_LOG, USUAL_LOG)
+
+    @classmethod
+    def of_earlier_strips(cls, factors: tuple[float, float]) -> Beforehand:
+        """Where factors, those above 1, have been learnt: their mean square is what is in force."""
+        learnt = [f > 1.0 for f in factors]
+        a, b = (np.log(f) - FROM_STRIP_TO_STRIP_LOG**2 if it else 0.0 for f, it in zip(factors, learnt, strict=True))
+        c, d = (FROM_STRIP_TO_STRIP_LOG if it else USUAL_LOG for it in learnt)
+        return cls((float(a), float(b)), (c, d))
+
+    def cost(self, f: float, g: float) -> float:
+        """Minus twice the logarithm of the density of two factors, but for a constant."""
+        a, b = self.mean
+        c, d = self.sigma
+        return float(((np.log(f) - a) / c) ** 2 + ((np.log(g) - b) / d) ** 2)
+
+
+NOTHING = Beforehand()
+
+
 class Likelihood:
     """Minus twice the logarithm of the restricted likelihood of a choice of factors, its *cost*.
 
@@ -68,6 +97,7 @@ class Likelihood:
     Parameters
     ----------
     pair : groups of position and attitude
+    beforehand : what is known of the factors without the data in the window
 
     Attributes
     ----------
@@ -75,9 +105,11 @@ class Likelihood:
     changes : of the state for which it holds
     """
 
-    def __init__(self, strip: WindowStrip, state: WindowState, pair: tuple[int, int]) -> None:
+    def __init__(
+        self, strip: WindowStrip, state: WindowState, pair: tuple[int, int], beforehand: Beforehand = NOTHING
+    ) -> None:
         self.noise: LookNoise | None = None
-        self.strip, self.changes = strip, state.changes
+        self.strip, self.changes, self.beforehand = strip, state.changes, beforehand
         matrix, rhs = state.normal()
         own, self._apriori, self._rows = [], [], []
         for group in pair:
@@ -129,7 +161,7 @@ class Likelihood:
         of_looks = 0.0
         if self.noise is not None and h > 1.0:
             of_looks = 2.0 * self.noise.rows * np.log(h) - (1.0 - h**-2) * self.noise.square
-        far = (np.log(f) ** 2 + np.log(g) ** 2 + np.log(h) ** 2) / USUAL_LOG**2
+        far = self.beforehand.cost(f, g) + np.log(h) ** 2 / USUAL_LOG**2
         return float(gained + 2.0 * (a * np.log(f) + b * np.log(g)) + of_looks + far)
 
     def _without_others(self, h: float) -> _Eliminated | None:

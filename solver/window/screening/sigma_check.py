@@ -36,7 +36,7 @@ from ..state.sigma_factors import CHANGED, LARGEST, MOST_UP, changed
 from ..state.strip import WindowStrip
 from .disagreement import CLEARLY, Disagreement
 from .kept_wanders import KeptWanders
-from .likelihood import Likelihood, likely
+from .likelihood import NOTHING, Beforehand, Likelihood, likely
 from .look_noise import LEAST_LOOKS, NoiseOfLooks
 
 #: Residuals of a-priori equations are compared with their redundancy over so long, s.
@@ -88,6 +88,8 @@ class SigmaCheck:
         self._steady, self._changed_s, self._tells = 0, -np.inf, False
         self._told_platform: set[str] = set()
         self._likelihoods: dict[tuple[int, int], Likelihood] = {}
+        self._strip: WindowStrip | None = None
+        self._from_earlier: dict[tuple[int, int], Beforehand] = {}
         self._kept = KeptWanders()
         self.events: list[str] = []
 
@@ -111,6 +113,7 @@ class SigmaCheck:
         strip = next((s for s in reversed(network.flown) if s.first_line_time_s <= now_s), None)
         if strip is None or not len(network.batches):
             return False, False
+        self._remember(strip, now_s)
         self._tells = self._tells or len(self._looks.controlled()) >= LEAST_LOOKS
         network.state.solve()
         network.state.expect([network.state.numbers])
@@ -135,6 +138,18 @@ class SigmaCheck:
         self._tell()
         self._tell_platform()
         return of_slow, of_image
+
+    def _remember(self, strip: WindowStrip, now_s: float) -> None:
+        """Keep what earlier strips have shown where one begins: its first looks say little of its sigmas.
+
+        The constant errors of a strip are one sample more of the same sigma; its wanders are judged by its own looks as
+        soon as there are enough of them.
+        """
+        if strip is not self._strip:
+            self._strip, learnt = strip, self._network.sigmas.apriori.tolist()
+            self._from_earlier = {(f, g): Beforehand.of_earlier_strips((learnt[f], learnt[g])) for f, g in self._pairs}
+        if now_s > strip.first_line_time_s + MEMORY_S:
+            self._from_earlier.pop(WANDERS, None)
 
     def _question_camera(self, strip: WindowStrip) -> None:
         """State larger errors of the camera where its calibration is contradicted by more than looks disagree, and no
@@ -235,7 +250,8 @@ class SigmaCheck:
         """The cost of factors of a pair: as it was where nothing has changed since but these factors."""
         cost = self._likelihoods.get(pair)
         if cost is None or cost.strip is not strip or cost.changes != self._network.state.changes:
-            cost = self._likelihoods[pair] = Likelihood(strip, self._network.state, pair)
+            beforehand = self._from_earlier.get(pair, NOTHING)
+            cost = self._likelihoods[pair] = Likelihood(strip, self._network.state, pair, beforehand)
         return cost
 
     def _offset_or_mounting(self, strip: WindowStrip, now_s: float) -> bool:

@@ -35,6 +35,8 @@ class SigmaFactors:
 
 
 def changed(factor: float, ratio: float) -> float:
-    """A factor that residuals ask to be multiplied by a ratio: itself where that makes little difference."""
+    """A factor that residuals ask to be multiplied by a ratio: itself, or 1, where that makes little difference."""
     new = min(max(factor * min(max(ratio, MOST_DOWN), MOST_UP), 1.0), LARGEST)
+    if new < CHANGED:
+        return 1.0
     return factor if max(new / factor, factor / new) < CHANGED and new > 1.0 else new

@@ -11,7 +11,7 @@ import pytest
 
 from triline.solver.adjustment.reliability import HEAVY_TAILS
 from triline.solver.camera.self_calibration import focal_length
-from triline.solver.models.base import ATTITUDE_WANDER, OFFSET, POSITION_WANDER, SHIFT, WANDERS, error_groups
+from triline.solver.models.base import ATTITUDE_WANDER, CONSTANT, OFFSET, POSITION_WANDER, SHIFT, WANDERS, error_groups
 from triline.solver.models.slow_errors import SlowErrors
 from triline.solver.models.wander import GLOBALS
 from triline.solver.simulation.error_models import ErrorModel
@@ -29,9 +29,18 @@ from triline.solver.window.quality.light import GOOD
 from triline.solver.window.results import TAKEN_BACK, WindowOptions
 from triline.solver.window.screening.disagreement import ENOUGH, RIGHT, Disagreement, variance_of_most
 from triline.solver.window.screening.kept_wanders import KeptWanders
-from triline.solver.window.screening.likelihood import USUAL_LOG, Likelihood, LookNoise, likely
-from triline.solver.window.screening.sigma_check import SigmaCheck
+from triline.solver.window.screening.likelihood import (
+    FROM_STRIP_TO_STRIP_LOG,
+    NOTHING,
+    USUAL_LOG,
+    Beforehand,
+    Likelihood,
+    LookNoise,
+    likely,
+)
+from triline.solver.window.screening.sigma_check import MEMORY_S, SigmaCheck
 from triline.solver.window.state.network import LiveNetwork
+from triline.solver.window.state.sigma_factors import changed
 from triline.solver.window.state.strip import WindowStrip
 from triline.solver.window.state.unknowns import WindowState
 
@@ -405,6 +414,34 @@ def test_residuals_and_redundancies_of_what_was_known_beforehand():
     assert (square >= 0).all() and (np.bincount(group, redundancy) <= np.bincount(group) + 1e-9).all()
 
 
+@pytest.mark.parametrize("factor", [1.3, 3.0])
+def test_a_strip_that_begins_keeps_what_earlier_ones_have_shown(camera_network, factor):
+    """Its first looks say little of its sigmas, and where data cannot tell all factors of the bank are averaged."""
+    state, check = camera_network.state, SigmaCheck(camera_network, Disagreement(camera_network.sigmas))
+    strip = camera_network.strips["S2"] = strip_in(state)
+    camera_network.sigmas.apriori[:] = factor
+    assert min(likely(Likelihood(strip, state, WANDERS), (factor, factor))[:2]) > 5.0
+    check._remember(strip, strip.first_line_time_s + 1.0)
+    for pair in (WANDERS, CONSTANT):
+        kept = likely(check._likelihood(strip, pair), (factor, factor))[:2]
+        assert kept == pytest.approx((factor, factor), rel=0.15)
+    check._remember(strip, strip.first_line_time_s + MEMORY_S + 1.0)  # by now it has looks of its own
+    seen(strip, state)
+    assert check._likelihood(strip, WANDERS).beforehand == NOTHING != check._likelihood(strip, CONSTANT).beforehand
+
+
+def test_what_is_as_stated_is_not_kept_from_strip_to_strip():
+    assert Beforehand.of_earlier_strips((1.0, 1.0)) == NOTHING
+    mixed = Beforehand.of_earlier_strips((1.0, 3.0))
+    assert mixed.sigma[0] == USUAL_LOG and mixed.sigma[1] == FROM_STRIP_TO_STRIP_LOG
+    assert np.exp(mixed.mean[1] + mixed.sigma[1] ** 2) == pytest.approx(3.0)  # root of the mean square
+
+
+def test_a_factor_of_next_to_nothing_is_none():
+    assert changed(1.3, 1.1 / 1.3) == 1.0
+    assert changed(1.3, 1.2 / 1.3) == 1.3 and changed(1.3, 1.5) == pytest.approx(1.95)
+
+
 def test_groups_go_by_the_words_of_the_labels():
     labels = ("X offset of strip shift", "kappa shift of strip S1", "phi drift of strip S1")
     wander = ("Y wander value at border 3 of strip S1", "wander of omega over segment 2 of strip S1")
@@ -432,6 +469,17 @@ def test_points_of_two_looks_tell_until_there_are_others(camera_network):
     assert 2.2 < camera_network.sigmas.disagreement < 4.0
     newest.entered((RIGHT * s, 1, True) for s in rng.chisquare(1, ENOUGH))
     assert camera_network.sigmas.disagreement == 1.0
+
+
+def test_all_points_that_come_at_once_tell(camera_network):
+    """The last ones of a long update have the error of one orientation in common."""
+    ratios = RIGHT * np.random.default_rng(1).chisquare(1, 300)
+    ratios[-80:] *= 20.0
+    newest = Disagreement(camera_network.sigmas)
+    newest.entered((s, 1, True) for s in ratios)
+    assert camera_network.sigmas.disagreement == 1.0
+    newest.entered((s, 1, True) for s in ratios[-40:])  # nothing older is left of them than of any others
+    assert camera_network.sigmas.disagreement > 2.0
 
 
 def test_a_few_points_say_nothing(camera_network):
