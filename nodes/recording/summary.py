@@ -75,11 +75,19 @@ def topic_summaries(reader: RecordingReader) -> list[TopicSummary]:
             row.duplicates += 0 if reader.by_ranges else len(chosen) - len(distinct)
             if not topics.find(channel.topic).latched and topics.find(channel.topic).family is not Family.STATUS:
                 row.backwards += int((np.diff(stamps[np.argsort(sequences, kind="stable")]) < 0).sum())
+    timed = {c.topic for c in reader.channels.values() if c.known and _is_timed(c.topic)}
     for row in by_topic.values():
-        span_s = (row.last_ns - row.first_ns) / 1e9 if row.first_ns else 0.0  # 0: said before any time was known
+        known = row.first_ns != 0 or row.topic in timed  # 0 of others: said before any time was known
+        span_s = (row.last_ns - row.first_ns) / 1e9 if known else 0.0
         row.rate_hz = (row.messages - 1) / span_s if span_s > 0 and row.topic not in IN_BURSTS else 0.0
         row.sources.sort()
     return sorted(by_topic.values(), key=lambda row: (_place(row.topic), row.topic))
+
+
+def _is_timed(topic: str) -> bool:
+    """Whether the stamps of a topic tell when a flight was."""
+    row = topics.find(topic)
+    return row.family in _TIMED and not row.latched
 
 
 def time_span_ns(reader: RecordingReader, among: NDArray[np.int64] | None = None) -> tuple[int, int] | None:
@@ -87,8 +95,7 @@ def time_span_ns(reader: RecordingReader, among: NDArray[np.int64] | None = None
 
     What is handed to whoever joins later, such as given ground points, is known before a flight and does not count.
     """
-    rows = {c.id: topics.find(c.topic) for c in reader.channels.values() if c.known}
-    timed = [id for id, row in rows.items() if row.family in _TIMED and not row.latched]
+    timed = [c.id for c in reader.channels.values() if c.known and _is_timed(c.topic)]
     numbers = np.arange(len(reader.channel_of)) if among is None else among
     chosen = numbers[np.isin(reader.channel_of[numbers], timed)]
     if reader.by_ranges and len(chosen):  # the ends of each channel tell, see topic_summaries

@@ -22,15 +22,17 @@ _GREY = (110, 110, 120, 255)
 
 
 class ImagePart(Part):
-    """Rays of the strip that is flown: samples to the right, lines upwards, vectors enlarged as the scale bar says."""
+    """Rays of the newest strip of each CCD line: samples to the right, lines upwards, vectors enlarged as the scale bar
+    says. Points may have looks in several strips, and each scene of a satellite is a strip of one CCD line."""
 
     def __init__(self, state: SceneState) -> None:
         super().__init__(state)
         self._rays: dict[str, OrderedDict[tuple[str, int], Any]] = {}
-        self._strip = ""
+        self._strip: dict[str, str] = {}  # of each CCD line
         self._changed: set[str] = set()
         self._drawn_s = 0.0
-        self._framed: tuple[str, int, float] | None = None
+        self._framed: dict[str, tuple[str, int, float]] = {}
+        self._drawn_bar_px = state.bar_px
         self._sized = False
         self._squares: list[float] = []
 
@@ -39,17 +41,24 @@ class ImagePart(Part):
             return
         settled = message.body.status != message.body.LIVE
         for r in message.body.residuals:
-            if r.strip != self._strip:
-                self._strip = r.strip
-                self._rays = {ccd: OrderedDict() for ccd in self.state.ccds}
-                self._changed = set(self._rays)
-            rays = self._rays.get(r.ccd)
-            if rays is not None:
-                self._size(r)
-                rays[message.body.point, round(r.line)] = r.line, r.sample, r.v_line, r.v_sample, r.rejected, settled
-                if len(rays) > _NEWEST:
-                    rays.popitem(last=False)
-                self._changed.add(r.ccd)
+            if r.ccd not in self.state.ccds or self._is_earlier(r.strip, self._strip.get(r.ccd)):
+                continue
+            if r.strip != self._strip.get(r.ccd):
+                self._strip[r.ccd] = r.strip
+                self._rays[r.ccd] = OrderedDict()
+            rays = self._rays[r.ccd]
+            self._size(r)
+            rays[message.body.point, round(r.line)] = r.line, r.sample, r.v_line, r.v_sample, r.rejected, settled
+            if len(rays) > _NEWEST:
+                rays.popitem(last=False)
+            self._changed.add(r.ccd)
+
+    def _is_earlier(self, strip: str, shown: str | None) -> bool:
+        """Whether a strip began before the one that is shown."""
+        if shown is None or strip == shown:
+            return False
+        begun = [self.state.strips[id].first_line_time_ns for id in (strip, shown) if id in self.state.strips]
+        return len(begun) == 2 and begun[0] < begun[1]
 
     def _size(self, residual: Any) -> None:
         """Decide how long the scale bar is, by the first residuals."""
@@ -62,20 +71,25 @@ class ImagePart(Part):
             self._squares.clear()
 
     def draw(self, canvas: Canvas) -> None:
-        strip = self.state.strips.get(self._strip)
         due = self.state.closing or self.state.now_s - self._drawn_s >= _PERIOD_S
-        if strip is None or not self._changed or not due:
+        if self._drawn_bar_px != self.state.bar_px:
+            self._changed.update(self._rays)
+        shown = (ccd for ccd in self._changed if ccd in self.state.ccds)
+        changed = sorted(ccd for ccd in shown if self._strip[ccd] in self.state.strips)
+        if not changed or not due:
             return
+        self._drawn_bar_px = self.state.bar_px
         self._drawn_s = self.state.now_s
         width, height = self.state.image_size
-        newest = max((line for rays in self._rays.values() for line, *_ in rays.values()), default=0.0)
-        lines = max(float(strip.lines or _LENGTH_S * strip.line_rate_hz), 1.0)
-        while newest > lines:
-            lines *= 2
-        along = height / lines
         bar = _BAR * width
         scale = bar / self.state.bar_px
-        for ccd in sorted(self._changed):
+        for ccd in changed:
+            lines = self._lines(self._strip[ccd])
+            along = height / lines
+            framed = self._strip[ccd], round(lines), self.state.bar_px
+            if self._framed.get(ccd) != framed:
+                self._framed[ccd] = framed
+                self._frame(canvas, ccd, bar)
             rows = np.array([row for row in self._rays[ccd].values()], dtype=float).reshape(-1, 6)
             origin = np.column_stack([rows[:, 1], height - rows[:, 0] * along])
             vector = scale * np.column_stack([rows[:, 3], -rows[:, 2]])
@@ -88,16 +102,22 @@ class ImagePart(Part):
             for name, chosen in (("residuals", ~bad), ("rejected", bad)):
                 own = [REJECTED if bad[i] else shades[i] for i in np.flatnonzero(chosen)]
                 canvas.arrows(f"image/{ccd}/{name}", origin[chosen], vector[chosen], own, 0.9)
-        self._changed.clear()
-        framed = self._strip, round(lines), self.state.bar_px
-        if self._framed != framed:
-            self._framed = framed
-            self._frame(canvas, width, height, bar)
+        self._changed.difference_update(changed)
 
-    def _frame(self, canvas: Canvas, width: float, height: float, length: float) -> None:
+    def _lines(self, strip: str) -> float:
+        """Lines of a strip that a view has room for: as planned, or more once there are more; the same in all views."""
+        told = self.state.strips[strip]
+        lines = max(float(told.lines or _LENGTH_S * told.line_rate_hz), 1.0)
+        own = (rays for ccd, rays in self._rays.items() if self._strip[ccd] == strip)
+        newest = max((line for rays in own for line, *_ in rays.values()), default=0.0)
+        while newest > lines:
+            lines *= 2
+        return lines
+
+    def _frame(self, canvas: Canvas, ccd: str, length: float) -> None:
         """Outline of the strip and a scale bar."""
-        for ccd in self.state.ccds:
-            box = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]])
-            canvas.lines(f"image/{ccd}/frame", [box], [_GREY], 0.7)
-            bar = np.array([[-0.015 * width - length, 0.9 * height]])
-            canvas.arrows(f"image/{ccd}/scale", bar, np.array([[length, 0.0]]), [(255, 255, 255, 255)], 1.2)
+        width, height = self.state.image_size
+        box = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]])
+        canvas.lines(f"image/{ccd}/frame", [box], [_GREY], 0.7)
+        bar = np.array([[-0.015 * width - length, 0.9 * height]])
+        canvas.arrows(f"image/{ccd}/scale", bar, np.array([[length, 0.0]]), [(255, 255, 255, 255)], 1.2)

@@ -192,7 +192,7 @@ class SceneState:
 
     def seconds(self, stamp_ns: int) -> float:
         """Seconds since the start."""
-        return (stamp_ns - (self.start_ns or stamp_ns)) / convert.SECOND_NS
+        return (stamp_ns - (stamp_ns if self.start_ns is None else self.start_ns)) / convert.SECOND_NS
 
     def on_strip(self, time_ns: int) -> bool:
         """Whether a strip is flown at a time; always where no strip is known."""

@@ -17,6 +17,10 @@ class Notebook(NullCanvas):
         self.times = defaultdict(int)
         self.curves = defaultdict(lambda: ([], []))
         self.styles, self.events, self.layouts, self.closed = {}, [], [], 0
+        self.moments = []
+
+    def at(self, time_s):
+        self.moments.append(time_s)
 
     def _note(self, entity, *what):
         self.drawn[entity] = what

@@ -71,6 +71,13 @@ def test_info(capsys, flight):
     assert summary["damage"] == [] and summary["duration_s"] == pytest.approx(2.995)
 
 
+def test_stamps_from_zero_have_a_rate(capsys, tmp_path):
+    """Sensor folders count seconds from where they will: what began at 0 s had no rate."""
+    fixes = [Message("sensor/gnss", k * 200_000_000, sample.body("sensor/gnss", k), "test", k) for k in range(11)]
+    code, out, _ = run(capsys, "info", write_recording(tmp_path / "zero.mcap", fixes), "--json")
+    assert code == 0 and json.loads(out)["topics"][0]["rate_hz"] == pytest.approx(5)
+
+
 def test_a_strip_that_has_not_ended_has_no_number_of_lines(capsys, tmp_path):
     """Drivers say it at the end; it had "0 lines"."""
     strip = m.Strip(id="S1", first_line_time_ns=sample.EPOCH_NS, line_rate_hz=200.0)

@@ -127,6 +127,51 @@ def test_residuals_in_image_space_have_the_size_of_the_bar(notes, messages, bar_
         assert not len(bad[1]) or np.linalg.norm(bad[1], axis=1).max() <= 2.001 * bar
 
 
+def test_residuals_of_points_that_several_strips_see_are_shown(messages):
+    """Each look of another strip had wiped what the views showed: of scenes nearly all."""
+    strip = next(m for m in messages if m.topic == "configuration/strip")
+    scenes = [replace(strip, body=type(strip.body).FromString(strip.body.SerializeToString())) for _ in "FNB"]
+    for ccd, scene in zip("FNB", scenes, strict=True):
+        scene.body.id = f"scene/{ccd}"
+    points = []
+    for message in messages:
+        if message.topic == "point/object":
+            body = type(message.body).FromString(message.body.SerializeToString())
+            for r in body.residuals:
+                r.strip = f"scene/{r.ccd}"
+            points.append(replace(message, body=body))
+    configuration = [m for m in messages if m.topic in ("configuration/project", "configuration/camera")]
+    canvas = Notebook()
+    show([*configuration, *scenes, *points], canvas)
+    for ccd in "FNB":
+        told = {(m.body.point, round(r.line)) for m in points for r in m.body.residuals if r.ccd == ccd}
+        shown = sum(len(canvas.drawn[f"image/{ccd}/{name}"][0]) for name in ("residuals", "rejected"))
+        assert shown == len(told) > 100
+
+
+def test_an_earlier_strip_does_not_come_back_into_view(messages):
+    strip = next(m for m in messages if m.topic == "configuration/strip")
+    before = type(strip.body).FromString(strip.body.SerializeToString())
+    before.id, before.first_line_time_ns = "S0", before.first_line_time_ns - 10**11
+    chosen = [m for m in messages if m.topic.startswith("configuration/")]
+    points = [m for m in messages if m.topic == "point/object"]
+    late = type(points[-1].body).FromString(points[-1].body.SerializeToString())
+    for r in late.residuals:
+        r.strip = "S0"
+    canvas, usual = Notebook(), Notebook()
+    show([*chosen, *points], usual)
+    show([replace(strip, body=before), *chosen, *points, replace(points[-1], body=late)], canvas)
+    assert len(canvas.drawn["image/N/residuals"][0]) == len(usual.drawn["image/N/residuals"][0]) > 100
+
+
+def test_times_count_from_the_start_also_where_stamps_begin_at_zero(messages):
+    """Sensor folders count seconds from where they will: all that was flown stood at 0 s."""
+    kept = [m for m in messages if m.topic == "event/log"]
+    canvas = Notebook()
+    show([replace(m, stamp_ns=m.stamp_ns - START_NS) for m in kept], canvas)
+    assert len(canvas.moments) >= 2 and canvas.moments[-1] == pytest.approx(17.0)
+
+
 def test_small_residuals_get_a_smaller_bar(messages):
     small = []
     for m in messages:
