@@ -37,6 +37,7 @@ class ViewLayout:
     units : units of the parameters, one plot each
     strip_s : length of the longest strip, about
     window_s : length of the adjustment's window: so far back what is not final yet is shown in plots; None: all of it
+    adjusted : whether there is a camera, or anything of the adjuster; else there is nothing but a trajectory
     truth : whether errors against truth are shown
     mosaic : whether there is an orthoimage
     lines : ids of the CCD lines whose image lines come in; and width and height of a view of them
@@ -52,6 +53,7 @@ class ViewLayout:
     units: tuple[str, ...] = ()
     strip_s: float = 60.0
     window_s: float | None = None
+    adjusted: bool = True
     truth: bool = False
     mosaic: bool = False
     lines: tuple[str, ...] = ()

@@ -200,6 +200,8 @@ def open_canvas(mode: str) -> Canvas:
 
 def blueprint(layout: ViewLayout) -> rrb.Blueprint:
     """Arrangement of the views: an overview, and tabs with what one looks at more closely."""
+    if not layout.adjusted:
+        return _arranged(_navigation(layout))
     tabs = [_overview(layout), *([_residuals(layout)] if layout.lines else [])]
     tabs += [*([_mosaic(layout)] if layout.mosaic else []), _corrections(layout), _adjustment(layout)]
     tabs += [_parameters(layout)] if layout.units else []
@@ -251,6 +253,14 @@ def _arranged(views: rrb.Container) -> rrb.Blueprint:
         auto_views=False,
         auto_layout=False,
     )
+
+
+def _navigation(layout: ViewLayout) -> rrb.Container:
+    """Where nothing is adjusted: the trajectory, where it is on the map, and events."""
+    log = rrb.TextLogView(origin="/log", name="Events")
+    about = rrb.TextDocumentView(origin="/about", name="About this view")
+    side = [rrb.Tabs(log, about, active_tab=0), *([_map(layout)] if layout.geographic_centre is not None else [])]
+    return rrb.Horizontal(_flight(layout), rrb.Vertical(*side), column_shares=[1.6, 1])
 
 
 def _overview(layout: ViewLayout) -> rrb.Container:

@@ -183,16 +183,20 @@ class Scene:
         """Draw the rest and close the canvas."""
         self.state.closing = True
         self._release()
+        self.state.frame_flown()
         self.draw()
         self.canvas.close()
 
     def _lay_out(self) -> None:
-        """Arrange the views when what they frame has changed: a strip, the camera, the first truth or parameter."""
+        """Arrange the views when what they frame has changed: a strip (before the first, the trajectory), the camera,
+        the first truth or parameter."""
         s = self.state
         has = s.has_truth, s.has_mosaic, s.has_lines
+        adjusted = s.camera is not None or s.has_results
         key = (
-            tuple(s.extent),
+            tuple(s.extent) or (None if s.framed is None else tuple(s.framed.ravel())),
             s.camera is not None,
+            adjusted,
             has,
             tuple(s.units),
             s.placed is not None,
@@ -200,19 +204,20 @@ class Scene:
             s.window_s,
             s.strip_s,
         )
-        if key == self._laid_out or not s.extent:
+        if key == self._laid_out or (not s.extent and s.framed is None):
             return
         self._laid_out = key
         corners = self._corners()
         centre = corners.mean(axis=0)
-        first = next(iter(s.extent.values()))
-        along = (first[1] - first[0]) / max(float(np.linalg.norm(first[1] - first[0])), 1.0)
+        along = self._along()
         middle = None
         if s.placed is not None:
             place = s.placed.to_geodetic(centre + s.origin)
             middle = float(place[0]), float(place[1])
         layout = ViewLayout(
-            title=f"Deviations from {s.measured} and 3 sigma x {s.exaggeration:g}, residuals x {s.residual_scale:g}",
+            title=f"Deviations from {s.measured} and 3 sigma x {s.exaggeration:g}, residuals x {s.residual_scale:g}"
+            if adjusted
+            else f"Trajectory, {s.measured}",
             grid_m=s.grid_m,
             corners=corners,
             along=along,
@@ -221,6 +226,7 @@ class Scene:
             units=tuple(s.units),
             strip_s=s.strip_s,
             window_s=s.window_s,
+            adjusted=adjusted,
             truth=s.has_truth,
             mosaic=s.has_mosaic,
             lines=tuple(s.ccds) if s.has_lines else (),
@@ -250,9 +256,22 @@ class Scene:
             "the tests do not find is among the observations.",
         )
 
-    def _corners(self) -> Array:
-        """Ends of the strips in the air, with room for exaggerated deviations, and their swaths on the ground."""
+    def _along(self) -> Array:
+        """Direction of the first strip, or the longer side of what has been flown (3,)."""
         s = self.state
+        if s.extent or s.framed is None:
+            first = next(iter(s.extent.values()))
+            return (first[1] - first[0]) / max(float(np.linalg.norm(first[1] - first[0])), 1.0)
+        east, north = (s.framed[1] - s.framed[0])[:2]
+        return np.array([1.0, 0.0, 0.0] if east >= north else [0.0, 1.0, 0.0])
+
+    def _corners(self) -> Array:
+        """Ends of the strips in the air, with room for exaggerated deviations, and their swaths on the ground; without
+        a strip what has been flown."""
+        s = self.state
+        if not s.extent and s.framed is not None:
+            (w, so, low), (e, n, high) = s.framed + np.array([[-1.0], [1.0]]) * (0.05 * s.height_m)
+            return s.display(np.array([[x, y, z] for x in (w, e) for y in (so, n) for z in (low, high)]))
         places = []
         for start, end in s.extent.values():
             along = (end - start) / max(float(np.linalg.norm(end - start)), 1.0)

@@ -72,6 +72,9 @@ class SceneState:
     project, camera, frame, strips : configuration, as far as it has come; strip : id of the newest strip
     origin : (3,) subtracted from local coordinates for display; decided by the first pose
     extent : strip id -> (2, 3) first and last place of the perspective centre, as planned
+    imaged_by : strip id -> CCD lines that its tie points are in, so far
+    framed : (2, 3) least and largest coordinates of what the views frame as long as no strip is flown: the flown
+        trajectory, with room to go on; None before the first pose
     bar_px : residual that is drawn as long as the scale bar
     measured : the trajectory others are compared with, "filtered" or "smoothed"
     trajectory, truth : the newest poses of both
@@ -92,10 +95,14 @@ class SceneState:
         self.ground_m = 0.0
         self.height_m = 1000.0
         self.extent: dict[str, Array] = {}
+        self.framed: Array | None = None
+        self._flown: Array | None = None
         self.units: list[str] = []
         self.window_s: float | None = None
         self.has_truth = False
+        self.imaged_by: dict[str, set[str]] = {}
         self.has_mosaic = False
+        self.has_results = False
         self.has_lines = False
         self.bar_px = 1.0
         self.newest: PoseSample | None = None
@@ -110,6 +117,7 @@ class SceneState:
     def begin_again(self) -> None:
         """Local coordinates are in another frame from now on: forget those so far, and the display frame."""
         self.origin, self.extent, self.newest = np.zeros(3), {}, None
+        self.framed = self._flown = None
         self._control.clear()
         self.trajectory, self.truth = PoseHistory(), PoseHistory()
 
@@ -129,6 +137,10 @@ class SceneState:
             if self.start_ns is None:
                 self.start_ns = message.stamp_ns
             self.now_s = max(self.now_s, self.seconds(message.stamp_ns))
+            if topic == "observation/tie":
+                for image in body.images:
+                    self.imaged_by.setdefault(image.strip, set()).add(image.ccd)
+            self.has_results = self.has_results or topic.startswith(("adjustment/", "orientation/"))
             if topic == "adjustment/report":
                 self._note_window(message.stamp_ns, body)
 
@@ -160,6 +172,21 @@ class SceneState:
         if sample.valid:
             self.trajectory.add(sample)
         self._plan(sample)
+        if not self.extent:
+            self._frame(sample.position_l)
+
+    def _frame(self, place: Array) -> None:
+        """Let views frame what has been flown; with room, so that they are arranged anew a few times only."""
+        box = np.array([place, place]) if self._flown is None else self._flown
+        self._flown = np.array([np.minimum(box[0], place), np.maximum(box[1], place)])
+        if self.framed is None or (place < self.framed[0]).any() or (place > self.framed[1]).any():
+            room = max(0.5 * float(np.linalg.norm(self._flown[1] - self._flown[0])), self.height_m / 2)
+            self.framed = self._flown + np.array([[-room], [room]])
+
+    def frame_flown(self) -> None:
+        """Nothing more is flown: let views frame what was, and no more."""
+        if self._flown is not None:
+            self.framed = self._flown
 
     def _decide_frame(self, sample: PoseSample) -> None:
         anchor = np.mean(self._control, axis=0) if self._control else sample.position_l
@@ -197,6 +224,30 @@ class SceneState:
     def on_strip(self, time_ns: int) -> bool:
         """Whether a strip is flown at a time; always where no strip is known."""
         return not self.strips or any(self._flying(strip, time_ns) for strip in self.strips.values())
+
+    def ground_of(self, strip: str, position_l: Array, quaternion: Array) -> Array | None:
+        """Left and right end on the ground (2, 3) of what a strip images: of the CCD line that looks down, or of those
+        that its tie points are in where these are fewer, as of a scene. None where that does not meet the ground."""
+        if self.camera is None:
+            return None
+        told = self.imaged_by.get(strip)
+        R = matrix_from_quaternion(quaternion)
+        found = []
+        for k, line in enumerate(self.camera.lines):
+            if told and line.id not in told:
+                continue
+            ends = line.xy_mm[[0, -1]] - self.camera.principal_point_mm[k]
+            rays = np.column_stack([ends, np.full(2, -self.camera.focal_length_mm[k])]) @ R.T
+            if (rays[:, 2] < 0).all():
+                on_ground = position_l + ((self.ground_m - position_l[2]) / rays[:, 2])[:, None] * rays
+                aside = float(np.linalg.norm((on_ground.mean(axis=0) - position_l)[:2]))
+                found.append((aside, k, on_ground))
+        if not found:
+            return None
+        ends_l = min(found, key=lambda row: row[:2])[2]
+        along = forward(quaternion)
+        left = np.array([-along[1], along[0], 0.0])
+        return ends_l if (ends_l[0] - ends_l[1]) @ left >= 0 else ends_l[::-1]
 
     def display(self, position_l: Array) -> Array:
         """Display coordinates of local coordinates (..., 3)."""

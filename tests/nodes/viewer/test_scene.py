@@ -172,6 +172,43 @@ def test_times_count_from_the_start_also_where_stamps_begin_at_zero(messages):
     assert len(canvas.moments) >= 2 and canvas.moments[-1] == pytest.approx(17.0)
 
 
+def test_a_swath_lies_where_the_ccd_line_of_its_strip_looks(messages):
+    """Of a scene that looks forward it lay under the platform, kilometres from its points."""
+    chosen = [m for m in messages if m.topic.startswith(("configuration/", "observation/control", "trajectory/"))]
+    tie = next(m for m in messages if m.topic == "observation/tie")
+    body = type(tie.body).FromString(tie.body.SerializeToString())
+    forward = [image for image in body.images if image.ccd == "F"]
+    del body.images[:]
+    body.images.extend(forward)
+    ahead, usual = Notebook(), Notebook()
+    show(chosen, usual)
+    show([*chosen, replace(tie, body=body, stamp_ns=chosen[-1].stamp_ns)], ahead)
+    swath, under = (canvas.drawn["flight/window/live"][0][0] for canvas in (ahead, usual))
+    line = preset("ads40").lines[0]
+    reach = line.xy_mm[0, 0] / preset("ads40").focal_length_mm[0] * 1500.0
+    np.testing.assert_allclose(np.linalg.norm((swath - under)[:, :2], axis=1), abs(reach), rtol=0.05)
+
+
+def test_a_trajectory_alone_is_in_view(messages):
+    """Without a strip the views were never arranged: the viewer showed its own panels, and a piece of the line."""
+    canvas = Notebook()
+    show([m for m in messages if m.topic in ("configuration/project", "sensor/gnss", "trajectory/filtered")], canvas)
+    layout = canvas.layouts[-1]
+    flown = np.vstack([strips[0] for strips in canvas.pieces("flight/trajectory")])
+    low, high = layout.corners.min(axis=0), layout.corners.max(axis=0)
+    assert (low <= flown.min(axis=0)).all() and (high >= flown.max(axis=0)).all()
+    assert np.ptp(layout.corners, axis=0).max() < 1.2 * np.ptp(flown, axis=0).max()
+    assert layout.title == "Trajectory, filtered" and not layout.adjusted and layout.geographic_centre is not None
+    assert len(canvas.layouts) < 8  # each moves the eye of who looks on
+
+
+def test_before_the_first_strip_the_views_are_arranged(messages):
+    canvas = Notebook()
+    until = START_NS + 15 * 10**8
+    show([m for m in messages if m.stamp_ns < until], canvas)
+    assert canvas.layouts and canvas.layouts[-1].adjusted and set(canvas.layouts[-1].ccds) == set("FNB")
+
+
 def test_small_residuals_get_a_smaller_bar(messages):
     small = []
     for m in messages:
