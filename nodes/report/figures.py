@@ -25,6 +25,7 @@ SYMBOLS = ("X", "Y", "Z", "ω", "φ", "κ")
 MDEG = 1000.0 * float(np.degrees(1.0))
 SCALE = np.array([1.0, 1.0, 1.0, MDEG, MDEG, MDEG])
 _TELLING = 30  # redundancy from which sigma0 is shown
+_NARROWEST = 0.1  # of the map's length is its width at least, also of a straight flight
 _NAME = 12  # letters of a strip on the map
 _MOST_ARROWS = 300  # residuals of a CCD line that are drawn; arrows of more would cover each other
 _SIGMAS = 3.0
@@ -67,6 +68,9 @@ def trajectory_map(flight: Flight) -> Figure | None:
     else:
         ax.set_xlabel("east [km]")
         ax.set_ylabel("north [km]")
+    length, (low_y, high_y) = float(np.ptp(ax.get_xlim())), ax.get_ylim()
+    if (missing := _NARROWEST * length - (high_y - low_y)) > 0:
+        ax.set_ylim(low_y - missing / 2, high_y + missing / 2)
     fig.suptitle("Flight and ground points, local frame", x=0.01, ha="left", fontsize=9.5, fontweight="bold")
     fig.legend(loc="outside lower center", ncols=7)
     FigureCanvasSVG(fig)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -327,6 +328,30 @@ def test_nothing_of_the_map_is_cut_off(messages, east, north):
         for artist in [*figure.texts, *figure.legends, *figure.axes]:
             box = artist.get_tightbbox()
             assert box.y1 <= whole.y1 + 0.1 and box.y0 >= whole.y0 - 0.1 and box.x0 >= whole.x0 - 0.1, artist
+
+
+def test_the_map_of_a_straight_flight_has_a_width(messages):
+    """It was a line with the numbers of its axis upon each other."""
+    flight = collect([x for x in messages if x.topic in ("configuration/project", "trajectory/filtered")])
+    flight.poses["filtered"].position_l[:, 1] = 1e-3 * np.arange(len(flight.poses["filtered"]))
+    with styled():
+        figure = trajectory_map(flight)
+        figure.draw_without_rendering()
+    (axes,) = figure.axes
+    assert np.ptp(axes.get_ylim()) > 0.09 * np.ptp(axes.get_xlim())
+    names = [label.get_tightbbox() for label in axes.get_yticklabels() if label.get_text()]
+    inside = [box for box in names if axes.bbox.y0 - 9 < box.y0 < axes.bbox.y1]
+    assert len(inside) >= 2 and all(a.y1 < b.y0 for a, b in pairwise(inside))
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_points_that_came_out_worse_are_not_called_better(recording):
+    flight, held = read(recording)
+    result = analyse(flight, held)
+    assert "times better" in page(flight, result)
+    result["improvement"]["points"] = [0.8, 1.4, 1.3]
+    text = " ".join(page(flight, result).split())
+    assert "not better in every axis, at least 0.8 times as good" in text and "times better" not in text
 
 
 @pytest.mark.parametrize("role", ["planimetric", "height"])
