@@ -288,8 +288,10 @@ def _from_crs(
     """Latitude, longitude and height (n, 3), roll, pitch and heading (n, 3), and covariances as of a track, or None."""
     xyz, angles = table.stack(*PLACE), np.radians(table.stack(*_OPK))
     if not crs or crs == "local":
+        for name in PLACE:
+            if (named := table.headed.get(name, name)) != name:
+                raise UserError(f"{path}:1: {named}: coordinates of no local frame, wanted the --crs that they are in")
         frame = _frame_of(path, table, xyz)
-        check_place_units(path, table.headed, frame)
         position, R_l_crs = xyz, np.tile(np.eye(3), (len(xyz), 1, 1))
     else:
         refuse_missing_grids(crs, path)

@@ -491,6 +491,9 @@ def test_lines_in_a_local_frame_come_back_as_they_were(lat, lon, tmp_path):
         UserError, match="or of a local frame lat_deg, lon_deg, height_m beside them, as `triline export"
     ):
         read_trajectory_csv(path)
+    path.write_text(text.replace("X_m,Y_m", "X_deg,Y_deg"))  # of scenes in a geographic CRS
+    with pytest.raises(UserError, match="1: X_deg: coordinates of no local frame, wanted the --crs that they are in"):
+        read_trajectory_csv(path)
 
 
 def test_trajectory_csv_damaged(tmp_path):
