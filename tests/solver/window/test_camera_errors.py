@@ -27,7 +27,7 @@ from triline.solver.simulation.window_study import adjust_online, navigate, orie
 from triline.solver.window.quality.light import BADLY_CALIBRATED, FAILED, GOOD, WEAK
 from triline.solver.window.results import WindowOptions
 
-PLAN, OPTIONS = FlightPlan(strip_s=40.0), WindowOptions(grid_hz=4.0)
+PLAN, OPTIONS = FlightPlan(strip_s=40.0, lead_in_s=3.0, lead_out_s=2.0), WindowOptions(grid_hz=4.0)
 ADS40 = preset("ads40")
 
 
