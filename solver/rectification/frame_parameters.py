@@ -72,32 +72,37 @@ def stated_priors(camera: FrameCamera, position_m: ArrayLike, attitude_rad: Arra
     return np.where(sigma > 0, sigma, usual)
 
 
-def changed(camera: FrameCamera, name: str, by: float) -> FrameCamera:
-    """The camera with one parameter changed: a name of `PRIOR` or `TWELVE`, or ``k3``."""
+def changed(camera: FrameCamera, changes: Mapping[str, float]) -> FrameCamera:
+    """The camera with parameters changed.
+
+    Parameters
+    ----------
+    changes : change of each parameter by its name, one of `PRIOR` or `TWELVE`, or ``k3``; angles are those in the local
+        frame at the place of ``camera``
+
+    Raises
+    ------
+    KeyError : another name
+    """
+    by = dict.fromkeys((*PRIOR, *_PRIOR_12, "k3"), 0.0)
+    if not changes.keys() <= by.keys():
+        raise KeyError(f"{min(changes.keys() - by.keys())} is no parameter of a frame camera")
+    by |= changes
     C, R = camera.position_e, camera.R_ec
-    lat, lon, h = WGS84.geodetic(C)
-    R_el = LocalFrame(float(np.degrees(lat)), float(np.degrees(lon)), 0.0).R_el
-    f, pixel, principal = camera.focal_length_mm, camera.pixel_mm.copy(), camera.principal_point_mm.copy()
-    lens = camera.distortion.copy()
-    if name in ("omega", "phi", "kappa"):
-        angles = angles_from_matrix(R_el.T @ R)
-        angles[("omega", "phi", "kappa").index(name)] += by
-        R = R_el @ matrix_from_angles(*angles)
-    elif name in ("X", "Y", "Z"):
-        C = C + by * np.eye(3)["XYZ".index(name)]
-    elif name in ("lat", "lon"):
-        C = WGS84.cartesian(lat + by * (name == "lat"), lon + by * (name == "lon"), h)
-    elif name == "f":
-        f += by
-    elif name == "c":
-        pixel = pixel + by
-    elif name in ("dx", "dy"):
-        principal[("dx", "dy").index(name)] += by
-    else:
-        lens[("k1", "k2", "k3", "p1", "p2").index(name)] += by
+    if any(by[name] for name in ("omega", "phi", "kappa", "lat", "lon")):
+        lat, lon, h = WGS84.geodetic(C)
+        R_el = LocalFrame(float(np.degrees(lat)), float(np.degrees(lon)), 0.0).R_el
+        if by["omega"] or by["phi"] or by["kappa"]:
+            R = R_el @ matrix_from_angles(
+                *(angles_from_matrix(R_el.T @ R) + np.array([by["omega"], by["phi"], by["kappa"]]))
+            )
+        if by["lat"] or by["lon"]:
+            C = WGS84.cartesian(lat + by["lat"], lon + by["lon"], h)
+    lens = [by[name] for name in ("k1", "k2", "k3", "p1", "p2")]
     return FrameCamera(
-        C, R, f, pixel, camera.lines, camera.samples, principal_point_mm=principal, distortion=lens,
-        ellipsoid=camera.ellipsoid, refraction=camera.refraction,
+        C + np.array([by["X"], by["Y"], by["Z"]]), R, camera.focal_length_mm + by["f"], camera.pixel_mm + by["c"],
+        camera.lines, camera.samples, principal_point_mm=camera.principal_point_mm + np.array([by["dx"], by["dy"]]),
+        distortion=camera.distortion + np.array(lens), ellipsoid=camera.ellipsoid, refraction=camera.refraction,
     )  # fmt: skip
 
 
@@ -169,9 +174,7 @@ def fit_frame(
     prior = np.asarray(prior_sigma, dtype=float)
 
     def conditions(beta: Array, observed: Array) -> Array:
-        other = camera
-        for name, value in zip(names, beta, strict=True):
-            other = changed(other, name, float(value))
+        other = changed(camera, dict(zip(names, beta.tolist(), strict=True)))
         line, sample, height, e, n, lat, lon = observed.T
         located = other.direct(line, sample, height)
         east, north = metres_a_radian(lat, height, other.ellipsoid)
@@ -193,6 +196,4 @@ def fit_frame(
         _LAST_STEP,
     )
     found = estimate(model, snoop)
-    for name, value in zip(names, found.parameters, strict=True):
-        camera = changed(camera, name, float(value))
-    return FrameFit(camera, names, found)
+    return FrameFit(changed(camera, dict(zip(names, found.parameters.tolist(), strict=True))), names, found)

@@ -47,7 +47,7 @@ def design(parameters: int, line: Array, sample: Array) -> Array:
     east, north = metres_a_radian(base[:, 0], base[:, 2], WGS84)
     columns = []
     for name, sigma in zip(names_of(parameters), prior_sigmas(parameters), strict=True):
-        ends = [changed(camera, name, s * sigma).direct(line, sample, np.full(len(line), HEIGHT_M)) for s in (1, -1)]
+        ends = [changed(camera, {name: s * sigma}).direct(line, sample, np.full(len(line), HEIGHT_M)) for s in (1, -1)]
         d = (ends[0] - ends[1]) / (2.0 * sigma)
         columns.append(np.concatenate([d[:, 1] * east, d[:, 0] * north]))
     return np.stack(columns, axis=1)
@@ -177,16 +177,15 @@ def iterations(parameters: int, where: str, rng: np.random.Generator) -> tuple[i
     parameters with which the pixels miss the Earth.
     """
     line, sample = nine_pixels(where)
-    base = bilsat_camera().direct(line, sample, np.full(len(line), HEIGHT_M))
+    camera = bilsat_camera()
+    base = camera.direct(line, sample, np.full(len(line), HEIGHT_M))
     east, north = metres_a_radian(base[:, 0], base[:, 2], WGS84)
     prior = prior_sigmas(parameters)
     names = names_of(parameters)
 
     def ground(values: Array) -> Array:
-        camera = bilsat_camera()
-        for name, value in zip(names, values, strict=True):
-            camera = changed(camera, name, float(value))
-        located = camera.direct(line, sample, np.full(len(line), HEIGHT_M))
+        other = changed(camera, dict(zip(names, values.tolist(), strict=True)))
+        located = other.direct(line, sample, np.full(len(line), HEIGHT_M))
         return np.concatenate([(located[:, 1] - base[:, 1]) * east, (located[:, 0] - base[:, 0]) * north])
 
     def model(values: Array) -> tuple[Array, Array]:

@@ -30,10 +30,22 @@ def control(rng, camera, points=28):
 def drawn(rng, parameters):
     """A camera whose parameters are off by their prior sigmas, and by how much."""
     off = prior_sigmas(parameters) * rng.standard_normal(parameters)
+    return changed(bilsat_camera(), dict(zip(names_of(parameters), off.tolist(), strict=True))), off
+
+
+@pytest.mark.parametrize("parameters", [12, 14])
+def test_parameters_that_change_together_are_those_that_change_one_by_one(parameters):
+    together, off = drawn(np.random.default_rng(3), parameters)
     camera = bilsat_camera()
-    for name, value in zip(names_of(parameters), off, strict=True):
-        camera = changed(camera, name, float(value))
-    return camera, off
+    for name, value in zip(names_of(parameters), off.tolist(), strict=True):
+        camera = changed(camera, {name: value})
+    camera, together = (changed(c, {"k3": 1e-12}) for c in (camera, together))
+    for name in ("position_e", "R_ec", "focal_length_mm", "pixel_mm", "principal_point_mm", "distortion"):
+        one, other, start = (getattr(c, name) for c in (camera, together, bilsat_camera()))
+        np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-14 if name == "distortion" else 1e-12)
+        assert np.any(other != start) or (name == "pixel_mm" and parameters == 12), name
+    with pytest.raises(KeyError, match="focus is no parameter"):
+        changed(camera, {"f": 0.1, "focus": 1.0})
 
 
 @pytest.mark.parametrize(
@@ -73,7 +85,7 @@ def test_the_camera_locates_and_a_blunder_is_left_out():
 
 def test_the_air_stays_where_it_is():
     """Control of a camera that sees through the air and looks 40 degrees aside changes nothing of that camera."""
-    camera = changed(bilsat_camera(), "phi", np.radians(40.0)).with_refraction(Refraction())
+    camera = changed(bilsat_camera(), {"phi": np.radians(40.0)}).with_refraction(Refraction())
     line, sample = (a.ravel() for a in np.meshgrid(*[np.linspace(0, 2047, 5)] * 2))
     lat, lon, height = camera.direct(line, sample, np.full(25, 500.0)).T
     points, names = FrameControl(line, sample, lat, lon, height), ("omega", "phi", "kappa")
