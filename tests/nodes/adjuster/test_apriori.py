@@ -189,7 +189,8 @@ def test_an_unknown_choice_is_refused():
 
 def test_a_navigator_that_has_no_fix_yet_does_not_say_how_good_the_trajectory_is():
     """Another project in mid-strip: both begin again, and the first poses, without a fix, are known to 10 m."""
-    simulation = simulate(FlightPlan(strips=1, strip_s=18.0, lead_in_s=3.0), 5, ErrorModel(), ObservationPlan())
+    plan = FlightPlan(strips=1, strip_s=18.0, lead_in_s=3.0, lead_out_s=2.0)
+    simulation = simulate(plan, 5, ErrorModel(attitude_rate_hz=100.0))
     navigator, adjuster, live, project = Navigator(), adjuster_of(), [], None
     for message in Simulator(simulation).messages(EPOCH):
         given = [message]

@@ -80,7 +80,7 @@ def test_strips_of_opposite_headings_find_the_lever_arm_in_window_and_batch():
         found.append((window.state.values(numbers), np.sqrt(np.diagonal(window.state.covariance(numbers)))))
 
     options = WindowOptions(grid_hz=4.0)
-    adjust_online(simulation, poses, options, live=False, watch=watch, update_s=0.5, platform=unknown)
+    adjust_online(simulation, poses, options, live=False, watch=watch, update_s=1.0, platform=unknown)
     network = network_of(simulation, poses)
     batch = run_batch(network, Job(WanderOptions(slow_errors_of(simulation.errors)), platform=unknown)).solution
     columns = batch.layout.platform_columns

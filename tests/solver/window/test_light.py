@@ -394,7 +394,7 @@ def test_a_flight_in_which_only_targets_were_found_says_so():
     plan = FlightPlan(strip_s=20.0, lead_in_s=3.0, lead_out_s=2.0)
     seen = ObservationPlan(tie_points_per_s=0.0, control=40, check=0)
     simulation = simulate(plan, 2, SENSORS, seen)
-    reports = adjust_online(simulation, navigate(simulation), WindowOptions()).reports
+    reports = adjust_online(simulation, navigate(simulation), WindowOptions(), update_s=0.5).reports
     shown = {(r.quality.light, r.quality.reason) for r in reports}
     assert {words for colour, words in shown if colour == GOOD} <= {"no strip is flown"}
     assert any("nothing but ground points" in words for _, words in shown)

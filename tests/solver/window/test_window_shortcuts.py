@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from triline.solver.adjustment.ray_statistics import whitened_pixels
 from triline.solver.adjustment.reduced_system import DenseFactor
+from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate
@@ -15,6 +18,9 @@ from triline.solver.window.results import WindowOptions
 from triline.solver.window.state.maker import BatchMaker, Draft
 from triline.solver.window.state.unknowns import WindowState
 from triline.solver.window.window import Window
+
+PLAN = FlightPlan(lead_in_s=3.0, lead_out_s=2.0)
+SENSORS = ErrorModel(attitude_rate_hz=100.0)
 
 
 def test_cofactors_of_the_last_unknowns() -> None:
@@ -90,7 +96,7 @@ def test_values_and_cofactors_if_others_were_held() -> None:
 
 def test_scores_of_drifts_are_those_of_the_residuals() -> None:
     """Of every batch of a window, whatever solution its residuals are for."""
-    simulation = simulate(FlightPlan(strip_s=12.0), 1, observation_plan=ObservationPlan(tie_points_per_s=6.0))
+    simulation = simulate(replace(PLAN, strip_s=12.0), 1, SENSORS, ObservationPlan(tie_points_per_s=6.0))
     compared = 0
 
     def watch(_: float, window: Window) -> None:
@@ -116,7 +122,7 @@ def test_scores_of_drifts_are_those_of_the_residuals() -> None:
 @pytest.mark.study
 def test_a_joined_batch_says_what_its_parts_said() -> None:
     """Rays that come a few at a time: batches of a time are joined, and together know what they knew."""
-    simulation = simulate(FlightPlan(strip_s=24.0), 1, observation_plan=ObservationPlan(tie_points_per_s=20.0))
+    simulation = simulate(replace(PLAN, strip_s=24.0), 1, SENSORS, ObservationPlan(tie_points_per_s=20.0))
     sizes, compared = [], 0
 
     def watch(now: float, window: Window) -> None:
@@ -154,8 +160,8 @@ def test_a_joined_batch_says_what_its_parts_said() -> None:
 def test_what_batches_keep_of_all_is_what_a_walk_over_them_gives() -> None:
     """While points come, looks are rejected, batches are joined and leave, over two strips."""
     plan = ObservationPlan(tie_points_per_s=6.0, outlier_share=0.05)
-    strips = FlightPlan(strips=2, strip_s=14.0, turns=False, gap_s=4.0, lead_in_s=3.0, lead_out_s=2.0)
-    simulation = simulate(strips, 3, observation_plan=plan)
+    strips = replace(PLAN, strips=2, strip_s=14.0, turns=False, gap_s=4.0)
+    simulation = simulate(strips, 3, SENSORS, plan)
     compared = 0
 
     def watch(_: float, window: Window) -> None:

@@ -34,7 +34,7 @@ def flight():
 
 @pytest.fixture(scope="module")
 def online(flight):
-    return adjust_online(*flight, WindowOptions(grid_hz=4.0))
+    return adjust_online(*flight, WindowOptions(grid_hz=4.0), update_s=0.5)
 
 
 # ---- robust start
