@@ -129,6 +129,5 @@ class GroundSearch:
         if len(some) < FEWEST:
             return None
         some = [some[i] for i in np.linspace(0, len(some) - 1, min(TOGETHER, len(some))).astype(int)]
-        points = self._looks.try_height(some, view, height)
-        enough = max(LEAST_FOUND, SHARE * len(some))
-        return points if points is not None and len(points) >= enough else None
+        points, _ = self._looks.try_height(some, view, height)
+        return points if len(points) >= max(LEAST_FOUND, SHARE * len(some)) else None

@@ -208,27 +208,28 @@ class LookMatcher:
 
     def try_height(
         self, tracks: Sequence[Track], view: int, height_m: float, reach_px: float | None = None
-    ) -> Array | None:
-        """Points (n, 3) of the places that are found in a view with a search about a height; nothing is noted.
+    ) -> tuple[Array, int]:
+        """Points (n, 3) of the places that are found in a view with a search about a height, and how many places have
+        the lines for it; nothing is noted.
 
-        ``reach_px`` is how far is searched, the largest reach if None. None where the orientation of the lines is not
-        known.
+        ``reach_px`` is how far is searched, the largest reach if None. No lines are those without orientation, too.
         """
         p = self.prediction
         line, sample = _at(tracks)
         scan = p.scan(p.master, line.min() - WIDE, line.max() + WIDE)
         if scan is None:
-            return None
+            return np.empty((0, 3)), 0
         guess_l, _ = scan.to_plane(line, sample, np.full(len(tracks), height_m))
         g = self._geometry(tracks, scan, p.heights.level(guess_l[:, :2], height_m))
         done = self._search_view(view, g, p.options.largest_reach_px if reach_px is None else reach_px)
         if done is None:
-            return None
+            return np.empty((0, 3)), 0
         found, _, _, parallax = done
         base = np.maximum(np.sum(parallax**2, axis=1), 1e-12)
         dz = np.sum(parallax * (found.shift - g.expected[:, view]), axis=1) / base
         good = verdict(found, p.options) == ""
-        return (g.ground.centre_l + np.column_stack([g.slope * dz[:, None], dz]))[good]
+        points = (g.ground.centre_l + np.column_stack([g.slope * dz[:, None], dz]))[good]
+        return points, int((found.reason != "no lines").sum())
 
     def finish(self, tracks: Sequence[Track]) -> Looked | None:
         """Places that have been looked for in all views become points; None if none was found often enough."""

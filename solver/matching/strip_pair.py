@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .consistency import Disagreement
-from .ground_search import LEAST_FOUND, SHARE, TOGETHER
+from .ground_search import AROUND, FEWEST, LEAST_FOUND, SHARE, TOGETHER
 from .kept_strip import StripView
 from .line_scan import LineScan
 from .looks import Looked, LookMatcher, Track
@@ -106,9 +106,9 @@ class StripPair:
 
     def match(self) -> list[MatchedTie]:
         """Look for the places that have been seen since the last time; the ties and later looks that follow."""
-        numbers, _ = self._ready()
+        numbers, at = self._ready()
         out: list[MatchedTie] = []
-        if len(numbers) and self._is_found(numbers):
+        if len(numbers) and self._is_found(numbers, at):
             numbers, at = self._ready()  # the ground may have been found at another height
             for part in _batches(at[:, 0], numbers, middle_first=not self._begun):
                 out += self._look(part)
@@ -191,7 +191,7 @@ class StripPair:
 
     # -- where the view lies, and the ground ---------------------------------------------------------------------------
 
-    def _is_found(self, numbers: NDArray[np.intp]) -> bool:
+    def _is_found(self, numbers: NDArray[np.intp], at: Array) -> bool:
         """Whether it is known how high the ground is, and where the view lies as far as searches reach; else look.
 
         Where it is not found it is looked for again once twice as many places have been seen, and when the strip is
@@ -208,21 +208,33 @@ class StripPair:
             return True
         if len(numbers) < self._wanted and not self._over:
             return False
-        some = _some([Track(self.master.places[number], 1) for number in numbers.tolist()])
+        tracks = [Track(self.master.places[number], 1) for number in numbers.tolist()]
+        some = _some(tracks, self._inner(tracks, at, AROUND))
         self._found = self._find_view(some, shifts) if p.heights.some else self._find_ground(some)
         self._wanted = 2 * len(numbers)
         if self._over and not self._found:
             self._decided[numbers] = True
-            self.counters["ground not found"] += len(numbers)
+            with_lines = int(self._inner(tracks, at, MARGIN + LEAST_SQUARES_HALF).sum())
+            self.counters["ground not found"] += with_lines
+            self.counters["no lines"] += len(numbers) - with_lines
         return self._found
+
+    def _inner(self, tracks: list[Track], at: Array, around: int) -> NDArray[np.bool_]:
+        """Which places (n,) have so many lines around them, in their own strip and in the later one as `seen` says."""
+        own = np.array([track.place.line for track in tracks])
+        good = np.ones(len(tracks), dtype=bool)
+        for view, line in ((self._views[0], own), (self._views[self._late], at[:, 0])):
+            assert view.ring is not None
+            good &= (line >= view.ring.start + around) & (line < view.ring.end - around)
+        return good
 
     def _find_view(self, some: list[Track], shifts: list[Array]) -> bool:
         """Match some places as if the view lay beside where it is looked for; whether it was found."""
         p = self._prediction
         for shift in shifts:
             p.slow.suppose(shift[None], self._options.largest_reach_px / 3)
-            points = self._looks.try_height(some, 0, p.heights.prior_m)
-            if points is not None and len(points) >= max(LEAST_FOUND, SHARE * len(some)):
+            points, tried = self._looks.try_height(some, 0, p.heights.prior_m)
+            if len(points) >= max(LEAST_FOUND, SHARE * tried):
                 return True
         p.slow.forget()
         return False
@@ -244,8 +256,8 @@ class StripPair:
             p.slow.forget()
             if beside.any():
                 p.slow.suppose(beside[None], reach / 3)
-            points = self._looks.try_height(some, 0, height, reach)
-            if points is None or len(points) < max(LEAST_FOUND, SHARE * len(some)):
+            points, tried = self._looks.try_height(some, 0, height, reach)
+            if len(points) < max(LEAST_FOUND, SHARE * tried):
                 continue
             p.heights.found(points)
             p.heights_changed()
@@ -257,10 +269,12 @@ class StripPair:
         return False
 
 
-def _some(tracks: list[Track]) -> list[Track]:
-    """A few of the places, evenly; those at the ends, about which lines may be missing, are left out."""
-    inner = tracks[len(tracks) // 5 : len(tracks) - len(tracks) // 5]
-    return [inner[i] for i in np.linspace(0, len(inner) - 1, min(TOGETHER, len(inner))).astype(int)]
+def _some(tracks: list[Track], inner: NDArray[np.bool_]) -> list[Track]:
+    """A few of the places, evenly: of those with lines all around; where these are few, of all but those at the ends,
+    about which lines may be missing."""
+    ends = len(tracks) // 5
+    most = [tracks[i] for i in np.flatnonzero(inner)] if inner.sum() >= FEWEST else tracks[ends : len(tracks) - ends]
+    return [most[i] for i in np.linspace(0, len(most) - 1, min(TOGETHER, len(most))).astype(int)]
 
 
 def _batches(line: Array, number: NDArray[np.intp], middle_first: bool) -> list[list[int]]:

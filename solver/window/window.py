@@ -53,6 +53,11 @@ AHEAD_S = 1.0
 UNKNOWNS_AHEAD_S = 60.0
 #: So long after its last look a point is in the window, s; later it is late.
 USUAL_DELAY_S = 2.0
+#: Where a strip of a camera with one view has earlier ones to be tied to, the window waits for looks that come late as
+#: long as so many lines take, but no longer than so many seconds: a matcher looks for the first places of such a strip
+#: in a wide search, with that many lines around them, which is long where few lines a second come. Tuned: with 80 px of
+#: reach a strip was found within 320 lines; the seconds bound the work of an update.
+WAITED_LINES, MOST_WAITED_S = 400, 60.0
 #: Rays tested again in one update at most, if there is more than one batch.
 MOST_RETESTED = 100
 #: Time between two looks at what corrections leave of the noise of poses, s.
@@ -406,11 +411,19 @@ class Window:
 
     def _limit_s(self) -> float:
         """What is older leaves. Where looks come late, as the first ones of a matcher that has to find its way, the
-        window waits for their partners, by its own length at most."""
+        window waits for their partners."""
         if not self._length_s:
             return -np.inf
         late_s = self._now_s - self._newest_ray_s - USUAL_DELAY_S
-        return self._now_s - self._length_s - min(max(late_s, 0.0), self._length_s)
+        return self._now_s - self._length_s - min(max(late_s, 0.0), self._longest_wait_s())
+
+    def _longest_wait_s(self) -> float:
+        """How long the window waits for looks that come late: its own length, or what some lines take; see
+        `WAITED_LINES`."""
+        if len(self.strips) < 2 or not has_one_view(self.camera, self.strips):
+            return self._length_s
+        newest = next(reversed(self.strips.values()))
+        return max(self._length_s, min(WAITED_LINES / newest.line_rate_hz, MOST_WAITED_S))
 
     def _due_for_test(self) -> list[Batch]:
         """Batches tested longest ago; the more rays they have, the fewer."""

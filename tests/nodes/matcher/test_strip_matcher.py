@@ -37,6 +37,7 @@ from triline.solver.matching.options import MatchingOptions, Place
 from triline.solver.matching.pair_prediction import PairPrediction
 from triline.solver.matching.round_earth import RoundHeights
 from triline.solver.matching.strip_matcher import StripMatcher
+from triline.solver.matching.strip_pair import Master, StripPair
 from triline.solver.models.dgr import DgrOptions
 
 #: EROS-A1 has one lens, which turns while it images: two overpasses.
@@ -274,6 +275,29 @@ def test_a_strip_of_one_ccd_line_whose_end_nobody_tells_is_tied(tmp_path):
 
 
 @pytest.mark.study
+def test_a_strip_of_few_lines_a_second_is_tied_while_it_is_flown(tmp_path, capsys):
+    """4 lines/s: 25 s go by before the first places have the lines around them that a search wants. The window waited
+    for 20 s at most, and refused them as too late."""
+    sensor, flight, out = (tmp_path / name for name in ("camera.json", "flight.mcap", "out.mcap"))
+    sensor.write_text(CAMERA.replace("500", "200").replace("0.0384", "0.064"))
+    plan = ["--strips", "2", "--sidelap", "0.8", "--seconds", "45", "--height", "5860", "--speed", "60", "--no-turns"]
+    simulate = ["simulate", "-q", "-o", str(flight), "--sensor", str(sensor), "--images", *plan, "--control", "0"]
+    rest = ["--check", "0", "--attitude-rate", "10", "--lead-in", "4", "--lead-out", "4", "--seed", "3"]
+    assert main([*simulate, *rest]) == 0
+    settings = tmp_path / "nodes.toml"
+    pace = "[navigator]\nfiltered_s = 0.1\n[adjuster]\nupdate_s = 2.0\nupdate_rays = 1000\n"
+    settings.write_text(f"[matcher]\nground_m = 0.0\n{pace}")
+    nodes = ["--nodes", "navigator,matcher,adjuster", "--processes", "1", "--config", str(settings)]
+    capsys.readouterr()
+    assert main(["process", str(flight), "-o", str(out), "--json", *nodes]) == 0
+    done = json.loads(capsys.readouterr().out)["counters"]
+    assert done["matcher"]["later looks"] > 60 and not done["matcher"].get("ground not found")
+    assert not done["adjuster"].get("too late")
+    tied = {x.body.point for x in RecordingReader(out).messages(["point/object"]) if x.body.rays > 1}
+    assert len(tied) > 0.9 * done["matcher"]["later looks"]
+
+
+@pytest.mark.study
 @pytest.mark.parametrize("world", ["as usual", "relief of 150 m", "three times the turbulence"])
 def test_matched_strips_of_one_ccd_line_are_as_good_as_they_say(world, tmp_path):
     """Three strips and one across, no control, four seeds: orientation and check points after the strips."""
@@ -361,8 +385,8 @@ def test_lines_that_a_budget_does_not_hold():
     assert [text for text in told if "hold the last" in text and "of 300 lines" in text]
 
 
-def of_one_line(pose, first_line=0, sigma_m=1e-3):
-    """A matcher of a camera with one CCD line, 1 km up, and its only strip, of 300 lines and 12 s."""
+def of_one_line(pose, first_line=0, sigma_m=1e-3, lines=300):
+    """A matcher of a camera with one CCD line, 1 km up, and its only strip, of 12 s and 300 lines at most."""
     camera = preset("spot5-hrs")
     line = camera.lines[0]
     lens = tuple(lens for lens in camera.lenses if lens.id == line.lens)
@@ -371,7 +395,7 @@ def of_one_line(pose, first_line=0, sigma_m=1e-3):
     for t in np.arange(0.0, 12.0, 0.05):
         covariance = np.diag([sigma_m**2] * 3 + [1e-12] * 3)
         matcher.add_pose(t, pose(t), np.array([0.0, 0, 0, 1]), covariance)
-    matcher.add_lines(line.id, first_line, np.full((300, 12000), 700, np.uint16))
+    matcher.add_lines(line.id, first_line, np.full((lines, 12000), 700, np.uint16))
     return matcher, matcher._strips["S1"].views[line.id]
 
 
@@ -425,6 +449,32 @@ def test_places_are_looked_for_no_farther_beside_a_strip_than_the_orientation_ma
         three_sigma = 3 * np.sqrt(2.0) * 0.3 / 0.0112
         assert 80 < three_sigma < 120
         assert 1430 < np.ptp(sample[seen]) < 1430 + 2.5 * three_sigma  # 118 of 134 m are beside
+
+
+def pair_of_strips(lines, step=10):
+    """Places of a strip without texture, and a strip beside it that has fewer lines; both are over."""
+    _, first = of_one_line(lambda t: np.array([60.0 * t, 0.0, 1000.0]))
+    _, second = of_one_line(lambda t: np.array([60.0 * t, 20.0, 1000.0]), lines=lines)
+    places = [Place(float(line), 6000.0) for line in range(10, 200, step)]
+    first.strip.over = second.strip.over = True
+    return StripPair(Master(first, "S1", places), second, 1, MatchingOptions(), RoundHeights(0.0, 60.0))
+
+
+def test_places_without_lines_are_not_counted_as_not_found():
+    """The second strip has 120 lines; places of the first one that it would see in lines up to 80 further are none that
+    were looked for in vain: "no tie point at 17 places" spoke of them, too."""
+    pair = pair_of_strips(120)
+    assert pair.match() == []
+    assert pair.counters["ground not found"] == 9  # lines 20 to 100: a match wants 13 lines on either side
+    assert pair.counters["no lines"] > 6
+
+
+def test_the_ground_is_found_where_a_third_of_the_places_is_that_have_lines(monkeypatch):
+    """Six of eight were too few, because twelve more had none."""
+    pair = pair_of_strips(300, step=4)
+    monkeypatch.setattr(pair._looks, "try_height", lambda tracks, *_: (np.zeros((6, 3)), len(tracks) - 12))
+    pair.match()
+    assert pair.counters["ground not found"] == 0
 
 
 def test_bad_input():

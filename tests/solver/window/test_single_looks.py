@@ -12,6 +12,7 @@ from three_strips import OPTIONS, PLAN, SENSORS, SIDE_BY_SIDE, TIES, flown, usua
 
 from triline.solver.camera.line_camera import LineCamera
 from triline.solver.camera.self_calibration import left_by_calibration
+from triline.solver.simulation import window_study
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_at_once, adjust_online, navigate, orientation_errors
 from triline.solver.window import leaving
@@ -122,6 +123,29 @@ def test_one_ccd_line_without_control_ties_its_strips(monkeypatch):
         assert np.sqrt(np.diag(online.whole_points[name].covariance)) == pytest.approx(sigma, rel=0.1)
     # the strips are final as they are flown, not when they are over
     assert max(known - o.time_s[-1] for known, o in zip(online.final_known_s, online.final, strict=True)) < 25.0
+
+
+def test_the_window_waits_for_looks_where_few_lines_a_second_come(monkeypatch):
+    """4 lines/s: a matcher has 100 lines around the first places of the second strip after 25 s. The window waited for
+    20 s at most, in every strip, so that these looks were too late."""
+    nadir = PLAN.camera.nadir_line
+    slow = LineCamera("slow", nadir_alone().lenses, (replace(nadir, xy_mm=nadir.xy_mm[50::100], chips=()),))
+    plan = replace(SIDE_BY_SIDE, camera=slow, strip_s=32.0)
+    ties = replace(TIES, tie_points_per_s=2.0, matching_delay_s=25.0, image_sigma_px=0.02)
+    simulation = simulate(plan, 11, replace(SENSORS, attitude_rate_hz=20.0), ties)
+    assert 3.0 < simulation.flight.strips[0].line_rate_hz < 6.0
+    begun_s, events = simulation.flight.strips[1].first_line_time_s, window_study._events
+
+    def told(*args):  # places of the first strip are told at once, as they are chosen
+        early = ((t, o, what) if o != 2 or t - 25.0 >= begun_s else (t - 25.0, o, what) for t, o, what in events(*args))
+        return sorted(early, key=lambda event: event[:2])
+
+    monkeypatch.setattr(window_study, "_events", told)
+    result = adjust_online(simulation, navigate(simulation), replace(OPTIONS, snoop=True), live=False, update_s=2.0)
+    seen = simulation.images.looks
+    of_both = set(seen.point[seen.strip == 0]) & set(seen.point[seen.strip == 1])
+    met = [p for p in result.whole_points.values() if p.rays > 1]
+    assert not looks_of(result, "too late") and len(met) > 0.95 * len(of_both) > 25
 
 
 def test_an_elevation_model_says_where_the_ground_is(monkeypatch):
