@@ -23,7 +23,7 @@ from .elevation import Elevation
 from .outputs import AdjusterOutputs, log
 from .pace import LOSSLESS, PARTS, Pace, Pacing, pace_message
 from .stated_control import StatedControl
-from .strips import AdjustedStrips
+from .strips import NOT_IMAGED, AdjustedStrips
 
 #: Image sigma where neither measurement nor project gives one, px.
 DEFAULT_IMAGE_SIGMA_PX = 0.3
@@ -405,15 +405,15 @@ class Adjuster(Node):
         if self._strips.is_held(body):
             self._strips.held_ties.append((body, source))
             return
-        sigma = self._project.image_sigma_px or DEFAULT_IMAGE_SIGMA_PX
+        sigma, now_s = self._project.image_sigma_px or DEFAULT_IMAGE_SIGMA_PX, self._seconds(self._stamp_ns)
         for image in body.images:
             look = Look(
                 image.strip, image.ccd, image.line, image.sample, image.sigma_line or sigma,
                 image.sigma_sample or sigma, source, self._seconds(image.time_ns) if image.time_ns else np.nan,
             )  # fmt: skip
             if body.point:
-                self._window.add_look(body.point, look)
-                self._strips.look(image.strip, image.line, self._window)
+                if self._strips.add_look(body.point, look, now_s, self._window) == NOT_IMAGED:
+                    self._outputs.refusals.append(Refusal(body.point, look, NOT_IMAGED))
             else:
                 self._outputs.refusals.append(Refusal("", look, "point without a name"))
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...solver.models.slow_errors import SlowErrors
 from ...solver.models.wander import Wander
+from ...solver.window.results import Look
 from ...solver.window.window import AHEAD_S, Window
 from .poses import PoseBuffer, SlowHistory, least_noise
 
@@ -19,6 +20,11 @@ REACHED_BACK_S = 10.0
 #: A strip whose end nobody tells is over when there has been no image point of it for so long, s, and another one has
 #: begun at least ``LEFT_S`` after the last. Two cameras that image at once begin together; a turn takes longer. Tuned.
 SILENT_S, LEFT_S = 30.0, 10.0
+#: An image point is refused that was imaged so long after the newest message, s: clocks of programs differ by less.
+#: Tuned.
+AHEAD_OF_NOW_S = 60.0
+#: What such a point, and a look that was taken or came too late, is called where it is counted.
+NOT_IMAGED, OF_ITS_STRIP = "not imaged yet", ("", "too late", "point is final", "duplicate")
 
 
 class AdjustedStrips:
@@ -46,6 +52,7 @@ class AdjustedStrips:
         self.events: list[str] = []
         self._held: dict[str, Any] = {}
         self._looked: dict[str, float] = {}  # newest line with an image point, of strips that go on
+        self._ahead: set[str] = set()  # strips of which an image point has been told that is not imaged yet
         self._slow = SlowHistory()
         self._stated: dict[str, tuple[SlowErrors, SlowErrors]] = {}  # of each strip: of the whole, and now
         self._handed_s = self._used_to_s = -np.inf
@@ -59,6 +66,7 @@ class AdjustedStrips:
         self.poses.clear()
         self._held.clear()
         self._looked.clear()
+        self._ahead.clear()
         self.held_ties.clear()
 
     @property
@@ -96,11 +104,35 @@ class AdjustedStrips:
         if body.ended:
             window.end_strip(body.id, int(body.lines), first_s + body.lines / body.line_rate_hz)
 
-    def look(self, id: str, line: float, window: Window) -> None:
-        """An image point of a strip has come."""
-        strip = window.strips.get(id)
-        if strip is not None and not strip.ended and line > self._looked.get(id, -1.0):
-            self._looked[id] = line
+    def add_look(self, name: str, look: Look, now_s: float, window: Window) -> str:
+        """Give the window an image point; returns why it is refused, "" if it is taken.
+
+        One that has not been imaged yet is refused: it would wait for its orientation, and keep its strip going.
+
+        Parameters
+        ----------
+        now_s : platform time of the newest message, s
+        """
+        strip = window.strips.get(look.strip)
+        if strip is None:
+            return window.add_look(name, look)
+        known = np.isfinite(look.time_s)
+        ahead_s = (look.time_s if known else strip.first_line_time_s + look.line / strip.line_rate_hz) - now_s
+        if ahead_s > AHEAD_OF_NOW_S:
+            self._counters[NOT_IMAGED] += 1
+            if look.strip not in self._ahead:
+                self._ahead.add(look.strip)
+                where = f"an image point of {name} in line {look.line:.6g}, which is imaged {ahead_s:.6g} s from now"
+                self.events.append(
+                    f"strip {look.strip}: {where}, is left out, as are others of the kind; what measures it has to "
+                    "count lines from the first of the strip"
+                )
+            return NOT_IMAGED
+        reason = window.add_look(name, look)
+        if reason in OF_ITS_STRIP and not strip.ended:
+            imaged = (now_s - strip.first_line_time_s) * strip.line_rate_hz
+            self._looked[look.strip] = max(self._looked.get(look.strip, -1.0), min(look.line, imaged))
+        return reason
 
     def end_forgotten(self, now_s: float, window: Window) -> None:
         """End strips whose end nobody has told: as long as one goes on, nothing is made whole, and no strip learns from

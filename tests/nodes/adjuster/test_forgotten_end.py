@@ -1,5 +1,7 @@
 """Strips whose end nobody tells: a program that images has crashed, and begins with another strip."""
 
+from dataclasses import replace
+
 import pytest
 
 from triline.nodes import convert
@@ -65,6 +67,27 @@ def test_a_strip_whose_end_nobody_tells_is_over_when_another_one_has_begun(messa
         assert [text for text in told if "S2 over" in text] == [
             o.body.message for _, o in expected if o.topic == "event/log" and "S2 over" in o.body.message
         ]
+
+
+def test_an_image_point_in_a_line_that_is_years_ahead_holds_no_strip_open(messages):
+    """One message was enough: the strip whose end nobody told went on until the end of the flight."""
+    given = [x for x in messages if not ends(x, "S1")]
+    at = next(k for k, x in enumerate(given) if x.topic == "observation/tie" and len(x.body.images) == 3)
+    rate = next(x.body.line_rate_hz for x in given if x.topic == "configuration/strip")
+    body = type(given[at].body)()
+    body.CopyFrom(given[at].body)
+    body.point = "far"
+    for image, time_ns in zip(body.images, (0, EPOCH_NS + int(1e19 / rate), given[at].stamp_ns), strict=True):
+        image.line, image.time_ns = 1e10, time_ns
+    given.insert(at + 1, replace(given[at], body=body))
+    outputs, counters = run(given)
+    told = [o.body.message for _, o in outputs if o.topic == "event/log"]
+    assert [text[:9] for text in told if "another one has begun, and nobody has told its end" in text] == ["strip S1:"]
+    assert counters["not imaged yet"] == 2 and counters["time is not that of its line"] == 1
+    (line,) = (text for text in told if "left out, as are others" in text)
+    assert line.startswith("strip S1: an image point of far in line 1e+10")
+    rejected = [r for _, o in outputs if o.topic == "adjustment/report" for r in o.body.rejected]
+    assert sum(r.point == "far" for r in rejected) == 3
 
 
 def late(message):
