@@ -39,6 +39,8 @@ from .authority import (
 PROBE_S = 2.0
 #: A certificate that expires within so many days is told.
 SOON_DAYS = 30
+#: It is told again where so many days are left, 1/24 is an hour, and when it has expired.
+AGAIN_DAYS = (SOON_DAYS, 7, 1, 1 / 24, 0)
 
 
 @dataclass(frozen=True)
@@ -62,11 +64,6 @@ class Bundle:
     revoked: dict[str, str]
     port: int
     until: datetime.datetime
-
-    @property
-    def expired(self) -> bool:
-        """Whether it has expired since it was checked; all links were closed then."""
-        return datetime.datetime.now(datetime.UTC) > self.until
 
     def ends_soon(self, now: datetime.datetime | None = None) -> str:
         """A line where the certificate expires within `SOON_DAYS`, or has; "" where not."""
@@ -177,6 +174,24 @@ def _alert(error: ssl.SSLError) -> str:
     if "CERTIFICATE_REQUIRED" in reason:
         return "wants a certificate"
     return f"refuses the connection: {reason.lower().replace('_', ' ')}"
+
+
+class ExpiryWatch:
+    """Tells the user of a program that goes on for long when the certificate of its bundle expires: weeks, a day and an
+    hour ahead, and when it has."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.bundle, self._told = bundle, 0
+
+    def look(self, now: datetime.datetime | None = None) -> str:
+        """A line where another one of the times in `AGAIN_DAYS` has come since the last look; else ""."""
+        now = now or datetime.datetime.now(datetime.UTC)
+        left = self.bundle.until - now
+        come = sum(left <= datetime.timedelta(days=days) for days in AGAIN_DAYS)
+        if come <= self._told:
+            return ""
+        self._told = come
+        return self.bundle.ends_soon(now)
 
 
 def load_bundle(folder: Path, now: datetime.datetime | None = None) -> Bundle:

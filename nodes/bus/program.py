@@ -14,13 +14,15 @@ from typing import Any
 
 from ..config import Tables
 from ..registry import SENSORS
-from .bundle import Bundle
+from .bundle import Bundle, ExpiryWatch
 from .priority import go_first
 from .session import Bus
 
 #: What is late where another program takes the processor is lost, or comes too late for who flies: these nodes go
 #: before others. The matcher and whoever draws use what is left.
 GO_FIRST = (*SENSORS, "navigator", "adjuster", "recorder", "router")
+#: A program looks so often whether its certificate expires soon, s.
+EXPIRY_EVERY_S = 20.0
 
 
 def _silent(text: str) -> None:
@@ -60,11 +62,22 @@ class ProgramOptions:
         bus = Bus(self.platform, source=self.name, port=self.port, file=self.bus_file, secure=self.secure)
         if alone := bus.why_alone():
             self.report(alone)
-        if self.secure is not None and (ends := self.secure.ends_soon()):
-            self.report(f"{self.name}: {ends}")
+        if self.secure is not None:
+            watch = ExpiryWatch(self.secure)
+            self.tell_expiry(watch)
+            threading.Thread(target=self._watch_expiry, args=(watch,), name="expiry", daemon=True).start()
         if niceness < 0:
             self.report(f"{self.name} goes before other programs (niceness {niceness})")
         return bus
+
+    def _watch_expiry(self, watch: ExpiryWatch) -> None:
+        while not self.stop.wait(EXPIRY_EVERY_S):
+            self.tell_expiry(watch)
+
+    def tell_expiry(self, watch: ExpiryWatch) -> None:
+        """Report where the certificate expires soon, and it has not been told."""
+        if line := watch.look():
+            self.report(f"{self.name}: {line}")
 
 
 #: Names the process that a node must not outlive.

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..bus.bundle import load_bundle
+from ..bus.bundle import ExpiryWatch, load_bundle
 from ..bus.folder_lock import locked
 from ..bus.processes import NodeGroup, NodeProcess
 from ..bus.program import end_by_signal
@@ -53,6 +53,7 @@ class LiveFlight:
     def __init__(self, args: argparse.Namespace, platform: str, title: str, estimators: tuple[str, ...]) -> None:
         self.args, self.platform, self.title, self.estimators = args, platform, title, estimators
         self.secure = load_bundle(args.secure) if args.secure is not None else None
+        self.expiry = ExpiryWatch(self.secure) if self.secure is not None else None
         if self.secure is not None and self.secure.kind != "aircraft":
             raise UserError(f"--secure {args.secure}: is of a desk, wanted the bundle of an aircraft")
         self.folder: Path = args.output
@@ -120,7 +121,7 @@ class LiveFlight:
         with NodeGroup(logs, self.platform, port, bus_file, self.args.secure) as group, _interruptible(self.stop):
             where = f"127.0.0.1:{port}" if bus_file is None else str(bus_file)
             self.say(f"bus on {where}; logs in {group.log_folder}; Ctrl-C ends the flight")
-            if self.secure is not None and (ends := self.secure.ends_soon()):
+            if self.expiry is not None and (ends := self.expiry.look()):
                 self.say(f"note: {ends}")
             group.start("recorder", "-o", str(self.recording))
             for name in self.estimators:
@@ -190,13 +191,9 @@ class LiveFlight:
 
     def _watch(self, group: NodeGroup, bus: Bus, show: Callable[[], None]) -> None:
         """Wait until the flight has ended; a node that dies is started again."""
-        expired = False
         while not self.over(group) and not self.stop.wait(0.25):
             self.tend(bus)
-            if not expired and self.secure is not None and self.secure.expired:
-                expired = True
-                if self.watch is not None:
-                    self.watch.tell(self.secure.ends_soon())
+            self._tell_expiry()
             show()
             for dead in group.dead():
                 if dead.name in self.sensor_ids():
@@ -220,6 +217,11 @@ class LiveFlight:
         for id in self.sensor_ids():
             if id in group.processes:
                 group.processes[id].stop()
+
+    def _tell_expiry(self) -> None:
+        """On the screen, where it comes nearer that the certificate expires, and when it has."""
+        if self.expiry is not None and self.watch is not None and (ends := self.expiry.look()):
+            self.watch.tell(ends)
 
     def _sensor_ended(self, dead: NodeProcess) -> None:
         after_s = min(SENSOR_AGAIN_S * 2 ** self._ended[dead.name], SENSOR_AGAIN_MOST_S)

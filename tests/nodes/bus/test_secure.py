@@ -13,7 +13,9 @@ import ssl
 import stat
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import sample_messages as sample
@@ -21,9 +23,11 @@ from bus_rig import Rig, free_port, triline, wait_for
 from cryptography import x509
 
 from triline.nodes.bus.authority import AIRCRAFT, CERTIFICATE, DESK, KEY, USES, Authority
-from triline.nodes.bus.bundle import load_bundle
+from triline.nodes.bus.bundle import ExpiryWatch, load_bundle
+from triline.nodes.bus.program import ProgramOptions
 from triline.nodes.bus.session import Bus
 from triline.nodes.cli import main
+from triline.nodes.cli.live_flight import LiveFlight
 from triline.nodes.errors import UserError
 from triline.nodes.node import Message
 
@@ -90,6 +94,38 @@ def test_certificates_have_names_and_uses_and_private_files_are_private(tmp_path
     assert configuration["access_control"]["default_permission"] == "deny"
 
 
+def test_a_program_that_goes_on_for_months_tells_ahead_that_its_certificate_expires(authority):
+    """It was told when a program began, to a router on the ground that had begun long before to nobody."""
+    bundle = load_bundle(authority.folder / "ann")
+    watch, hour = ExpiryWatch(bundle), datetime.timedelta(hours=1)
+    told = {
+        hours: watch.look(bundle.until - hours * hour) for hours in (9000, 721, 719, 700, 169, 167, 23, 2, 0.9, -1, -2)
+    }
+    assert [hours for hours, line in told.items() if line] == [719, 167, 23, 0.9, -1]
+    assert "'ann' expires on 20" in told[0.9] and "'ann' expired on 20" in told[-1]
+    assert ExpiryWatch(bundle).look() == ""
+
+    ends = replace(bundle, until=datetime.datetime.now(datetime.UTC) + 10 * hour)
+    said: list[str] = []
+    program = ProgramOptions("router", secure=ends, report=said.append)
+    watch = ExpiryWatch(ends)
+    program.tell_expiry(watch)
+    program.tell_expiry(watch)
+    assert [line[:35] for line in said] == ["router: the certificate of 'ann' ex"]
+
+
+def test_a_flight_tells_on_its_screen_that_its_certificate_expires(authority, monkeypatch):
+    bundle = load_bundle(authority.folder / "ann")
+    said: list[str] = []
+    flight = SimpleNamespace(expiry=ExpiryWatch(bundle), watch=SimpleNamespace(tell=said.append))
+    LiveFlight._tell_expiry(flight)  # type: ignore[arg-type]
+    assert not said
+    flight.expiry.bundle = replace(bundle, until=datetime.datetime.now(datetime.UTC) + datetime.timedelta(minutes=50))
+    LiveFlight._tell_expiry(flight)  # type: ignore[arg-type]
+    LiveFlight._tell_expiry(flight)  # type: ignore[arg-type]
+    assert len(said) == 1 and "'ann' expires on 20" in said[0]
+
+
 def test_a_bundle_that_cannot_be_used_is_refused_with_its_reason(authority, tmp_path):
     good = authority.folder / "ann"
     assert load_bundle(good).kind == DESK
@@ -107,7 +143,7 @@ def test_a_bundle_that_cannot_be_used_is_refused_with_its_reason(authority, tmp_
         r"the certificate of 'ann' expires on 20\d\d-\d\d-\d\d \d\d:\d\d UTC: from then on no program hears .*",
         load_bundle(good).ends_soon(weeks),
     )
-    assert "'ann' expired on 20" in load_bundle(good).ends_soon(years) and not load_bundle(good).expired
+    assert "'ann' expired on 20" in load_bundle(good).ends_soon(years)
 
     def spoilt(name: str, spoil) -> Path:
         folder = tmp_path / name
