@@ -12,7 +12,7 @@ from ...schemas.topics import Family
 from .reader import RecordingReader
 from .usable import usable
 
-_NO_END = "the file has no end: it was cut off, or its writer was killed"
+_NO_END = "the file has no end: it is being written, was cut off, or its writer was killed"
 #: Families whose stamps tell when a flight was.
 _TIMED = (Family.SENSOR, Family.OBSERVATION, Family.RESULT, Family.TRUTH)
 

@@ -176,7 +176,7 @@ class Scene:
         for topic, sample in self._held:
             self._take_pose(topic, sample)
         self._held.clear()
-        if self.state.closing and not self.state.measured:
+        if self.state.closing and not self.state.measured and self._waiting_truth:
             self._adopt_truth()
 
     def close(self) -> None:
@@ -195,6 +195,7 @@ class Scene:
         adjusted = s.camera is not None or s.has_results
         key = (
             tuple(s.extent) or (None if s.framed is None else tuple(s.framed.ravel())),
+            tuple(s.origin),
             s.camera is not None,
             adjusted,
             has,
@@ -210,14 +211,17 @@ class Scene:
         corners = self._corners()
         centre = corners.mean(axis=0)
         along = self._along()
+        measured = s.measured or "trajectory"
         middle = None
         if s.placed is not None:
             place = s.placed.to_geodetic(centre + s.origin)
             middle = float(place[0]), float(place[1])
         layout = ViewLayout(
-            title=f"Deviations from {s.measured} and 3 sigma x {s.exaggeration:g}, residuals x {s.residual_scale:g}"
+            title=f"Deviations from {measured} and 3 sigma x {s.exaggeration:g}, residuals x {s.residual_scale:g}"
             if adjusted
-            else f"Trajectory, {s.measured}",
+            else f"Trajectory, {s.measured}"
+            if s.measured
+            else "No trajectory yet; fixes are on the map",
             grid_m=s.grid_m,
             corners=corners,
             along=along,
@@ -240,7 +244,7 @@ class Scene:
             "about",
             f"Display origin: E {east:.0f} m, N {north:.0f} m, U {up:.0f} m in the local frame of "
             f"*{s.project.name if s.project is not None else 'no project'}*.\n\n"
-            f"Live, final and true trajectory: deviation from the {s.measured} one x {s.exaggeration:g}; ellipsoids: "
+            f"Live, final and true trajectory: deviation from the {measured} one x {s.exaggeration:g}; ellipsoids: "
             f"3 sigma of the final one x {s.exaggeration:g}.\n\n"
             f"Residuals x {s.residual_scale:g}: thin arrows are those of single rays laid on the ground, in the "
             "colour of their CCD line; they fade when the point is final. Thick arrows at control and check points "
@@ -283,6 +287,6 @@ class Scene:
         return s.display(np.array(places))
 
     def _legend(self, truth: bool) -> None:
-        rows = [(self.state.measured, FILTERED), *(row for row in LEGEND if truth or row[0] != "truth")]
+        rows = [(self.state.measured or "trajectory", FILTERED), *(row for row in LEGEND if truth or row[0] != "truth")]
         places = np.array([[100.0 * i, 0.0] for i in range(len(rows))])
         self.canvas.points("legend", places, [color for _, color in rows], 5.0, [text for text, _ in rows])

@@ -74,7 +74,7 @@ class SceneState:
     extent : strip id -> (2, 3) first and last place of the perspective centre, as planned
     imaged_by : strip id -> CCD lines that its tie points are in, so far
     framed : (2, 3) least and largest coordinates of what the views frame as long as no strip is flown: the flown
-        trajectory, with room to go on; None before the first pose
+        trajectory (before the first pose, the fixes), with room to go on; None before the first of them
     bar_px : residual that is drawn as long as the scale bar
     measured : the trajectory others are compared with, "filtered" or "smoothed"
     trajectory, truth : the newest poses of both
@@ -137,6 +137,8 @@ class SceneState:
             if self.start_ns is None:
                 self.start_ns = message.stamp_ns
             self.now_s = max(self.now_s, self.seconds(message.stamp_ns))
+            if topic == "sensor/gnss" and self.newest is None and self.placed is not None:
+                self._frame(self.placed.from_geodetic(body.latitude, body.longitude, body.altitude))
             if topic == "observation/tie":
                 for image in body.images:
                     self.imaged_by.setdefault(image.strip, set()).add(image.ccd)
@@ -162,6 +164,7 @@ class SceneState:
             return
         if self.newest is None:
             self._decide_frame(sample)
+            self.framed = self._flown = None
         elif sample.time_ns > self.newest.time_ns + 0.9 * _HISTORY_STEP_S * convert.SECOND_NS:
             step = (sample.time_ns - self.newest.time_ns) / convert.SECOND_NS
             speed = float(np.linalg.norm(sample.position_l - self.newest.position_l)) / step

@@ -71,6 +71,14 @@ def test_info(capsys, flight):
     assert summary["damage"] == [] and summary["duration_s"] == pytest.approx(2.995)
 
 
+def test_a_recording_without_an_end_may_be_one_that_is_being_written(capsys, flight, tmp_path):
+    """Of a flight that went on its writer was said to be killed."""
+    growing = tmp_path / "growing.mcap"
+    growing.write_bytes(flight.read_bytes()[: -len(b"\x89MCAP0\r\n")])
+    out = run(capsys, "info", growing)[1]
+    assert "the file has no end: it is being written, was cut off, or its writer was killed" in out
+
+
 def test_stamps_from_zero_have_a_rate(capsys, tmp_path):
     """Sensor folders count seconds from where they will: what began at 0 s had no rate."""
     fixes = [Message("sensor/gnss", k * 200_000_000, sample.body("sensor/gnss", k), "test", k) for k in range(11)]

@@ -202,6 +202,18 @@ def test_a_trajectory_alone_is_in_view(messages):
     assert len(canvas.layouts) < 8  # each moves the eye of who looks on
 
 
+def test_fixes_alone_are_in_view(messages):
+    """As long as the inertial unit is off, or of a flight that had none."""
+    canvas = Notebook()
+    fixes = [m for m in messages if m.topic == "sensor/gnss"]
+    show([*(m for m in messages if m.topic == "configuration/project"), *fixes], canvas)
+    layout = canvas.layouts[-1]
+    middle = [np.mean([m.body.latitude for m in fixes]), np.mean([m.body.longitude for m in fixes])]
+    np.testing.assert_allclose(layout.geographic_centre, middle, atol=2e-3)
+    assert np.ptp(layout.corners, axis=0).max() > 1000 and np.vstack(canvas.pieces("map/gnss")).shape[0] > 10
+    assert layout.title == "No trajectory yet; fixes are on the map"
+
+
 def test_before_the_first_strip_the_views_are_arranged(messages):
     canvas = Notebook()
     until = START_NS + 15 * 10**8
