@@ -79,6 +79,14 @@ def test_a_recording_without_an_end_may_be_one_that_is_being_written(capsys, fli
     assert "the file has no end: it is being written, was cut off, or its writer was killed" in out
 
 
+def test_a_view_of_a_recording_without_a_whole_message_tells_the_damage(capsys, flight, tmp_path):
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(flight.read_bytes()[:200])
+    code, _, said = run(capsys, "view", cut, "--rrd", tmp_path / "scene.rrd")
+    assert code == 1 and len(said.splitlines()) == 1
+    assert "nothing in it that can be shown (skipped 1 damaged place: the file ends inside a record" in said
+
+
 def test_stamps_from_zero_have_a_rate(capsys, tmp_path):
     """Sensor folders count seconds from where they will: what began at 0 s had no rate."""
     fixes = [Message("sensor/gnss", k * 200_000_000, sample.body("sensor/gnss", k), "test", k) for k in range(11)]
