@@ -114,7 +114,7 @@ class AdjustedStrips:
         now_s : platform time of the newest message, s
         """
         strip = window.strips.get(look.strip)
-        if strip is None:
+        if strip is None or not strip.contains(look.line):
             return window.add_look(name, look)
         known = np.isfinite(look.time_s)
         ahead_s = (look.time_s if known else strip.first_line_time_s + look.line / strip.line_rate_hz) - now_s
