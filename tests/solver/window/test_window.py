@@ -35,14 +35,14 @@ NEVER = 1e6
 
 @pytest.fixture(scope="module")
 def flight():
-    simulation = simulate(PLAN, 3, observation_plan=TIES)
+    simulation = simulate(PLAN, 3, SENSORS, TIES)
     return simulation, navigate(simulation)
 
 
 @pytest.fixture(scope="module")
 def adjusted(flight):
     """The flight adjusted with the usual options."""
-    return adjust_online(*flight, live=False, update_s=0.5)
+    return adjust_online(*flight, live=False, update_s=1.0)
 
 
 class Same(ModelOptions):
@@ -205,8 +205,8 @@ def test_consistent_over_seeds_and_better_than_direct_georeferencing(seeds):
 
 
 def test_without_control_there_is_a_result_with_large_honest_sigma():
-    simulation = simulate(PLAN, 5, observation_plan=replace(TIES, control=0))
-    result = adjust_online(simulation, navigate(simulation), live=False, update_s=0.5)
+    simulation = simulate(PLAN, 5, SENSORS, replace(TIES, control=0))
+    result = adjust_online(simulation, navigate(simulation), live=False, update_s=1.0)
     errors = orientation_errors(simulation, result.final)
     sigma = np.sqrt(np.einsum("nii->ni", errors.covariance))
     assert sigma[:, 0].min() > 0.3  # the datum rests on the a-priori offset
@@ -217,7 +217,7 @@ def test_without_control_there_is_a_result_with_large_honest_sigma():
 def test_without_any_tie_point_the_measured_trajectory_comes_back_with_its_sigma(flight):
     simulation, poses = flight
     nothing = replace(simulation, images=simulation.images.select(np.zeros(len(simulation.images), dtype=bool)))
-    result = adjust_online(nothing, poses, live=False, update_s=0.5)
+    result = adjust_online(nothing, poses, live=False, update_s=1.0)
     errors = orientation_errors(simulation, result.final)
     slow = slow_errors_of(simulation.errors)
     sigma = np.sqrt(errors.covariance[:, 0, 0])
@@ -274,7 +274,7 @@ def test_a_wrong_control_coordinate_is_left_out(flight, adjusted):
     wrong = np.flatnonzero(simulation.points.role == "control")[2]
     surveyed = simulation.surveyed_l.copy()
     surveyed[wrong, 2] += 5.0
-    result = adjust_online(replace(simulation, surveyed_l=surveyed), poses, live=False, update_s=0.5)
+    result = adjust_online(replace(simulation, surveyed_l=surveyed), poses, live=False, update_s=1.0)
     height = [orientation_errors(simulation, r.final).rmse[2] for r in (result, adjusted)]
     assert height[0] < 2.0 * height[1] + 0.1
 
@@ -340,7 +340,7 @@ def test_looks_of_a_time_without_poses_wait_for_smoothed_ones(flight, adjusted):
     begin_s = 12.0
     late = [p for p in poses if p.pose.smoothed or p.pose.time_s > begin_s]
     late = [replace(p, known_s=max(p.known_s, begin_s + 0.5)) if p.pose.smoothed else p for p in late]
-    waited = adjust_online(simulation, sorted(late, key=lambda p: p.known_s), live=False, update_s=0.5)
+    waited = adjust_online(simulation, sorted(late, key=lambda p: p.known_s), live=False, update_s=1.0)
     usual, used = (
         (sum(r.reason == "no orientation" for r in result.refused), len(result.final_points))
         for result in (adjusted, waited)
