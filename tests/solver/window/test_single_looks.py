@@ -45,7 +45,7 @@ def online():
 def side_by_side():
     """Two shorter strips, and what the window makes of them."""
     flight = flown(SIDE_BY_SIDE)
-    return flight, adjust_online(*flight, OPTIONS, live=False, update_s=0.5)
+    return flight, adjust_online(*flight, OPTIONS, live=False, update_s=1.0)
 
 
 def looks_of(result, reason):
@@ -96,7 +96,7 @@ def test_a_camera_with_one_ccd_line_has_a_window_of_its_own_and_loses_no_ties():
     early = np.unique(looks.point[(looks.strip == 0) & (since_s < 20.0)])
     begin = simulation.images.select((roles[looks.point] != "control") | np.isin(looks.point, early))
     result = adjust_online(
-        replace(simulation, images=begin), poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5
+        replace(simulation, images=begin), poses, replace(OPTIONS, snoop=True), live=False, update_s=1.0
     )
     left_s = [float(o.time_s[-1]) for o in result.final if o.strip == "S1"]
     assert left_s[0] < 25.0 and len(left_s) > 5 and left_s[-2] < 45.0
@@ -112,7 +112,7 @@ def test_one_ccd_line_without_control_ties_its_strips(monkeypatch):
     """Nobody says where the ground is, 700 m nearer than looks are linearised at first: none of them tied anything."""
     monkeypatch.setattr(leaving, "NOBODY_KNOWS_M", 2200.0)
     simulation, poses = flown(replace(PLAN, camera=nadir_alone()), replace(TIES, control=0))
-    online = adjust_online(simulation, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
+    online = adjust_online(simulation, poses, replace(OPTIONS, snoop=True), live=False, update_s=1.0)
     batch = adjust_at_once(simulation, poses, OPTIONS)
     ties = {name: p for name, p in batch.final_points.items() if p.rays > 1}
     met = [name for name in ties if name in online.whole_points]
@@ -153,7 +153,7 @@ def test_an_elevation_model_says_where_the_ground_is(monkeypatch):
     monkeypatch.setattr(first_ground, "LEAST_MEETING", 10**6)
     simulation, poses = flown(replace(SIDE_BY_SIDE, camera=nadir_alone()), replace(TIES, control=0))
     surface = surface_below(simulation, 3)
-    online = adjust_online(simulation, poses, OPTIONS, live=False, update_s=0.5, surface=surface)
+    online = adjust_online(simulation, poses, OPTIONS, live=False, update_s=1.0, surface=surface)
     batch = adjust_at_once(simulation, poses, OPTIONS, surface=surface)
     ties = [name for name, p in batch.final_points.items() if p.rays > 1]
     met = [name for name in ties if name in online.whole_points and online.whole_points[name].rays > 1]
@@ -237,7 +237,7 @@ def test_a_look_along_the_ground_is_left_out_and_nothing_else(side_by_side, monk
         return rows, origin
 
     monkeypatch.setattr(points, "rows_of", level)
-    flown_on = adjust_online(*flight, OPTIONS, live=False, update_s=0.5)
+    flown_on = adjust_online(*flight, OPTIONS, live=False, update_s=1.0)
     back = {name for name, _ in looks_of(flown_on, TAKEN_BACK)}
     assert back == {name for name, _ in looks_of(online, TAKEN_BACK)} - spoilt and len(spoilt) == 3
     for one, other in zip(flown_on.whole, online.whole, strict=True):
@@ -340,7 +340,7 @@ def test_a_look_without_ground_near_it_is_given_up(flight):
     few = images.select(keep)
     few = replace(few, sample=few.sample + 300.0 * (np.arange(len(few.sample)) == np.argmax(few.looks.point == pair)))
     spoilt = replace(simulation, images=few)
-    result = adjust_online(spoilt, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
+    result = adjust_online(spoilt, poses, replace(OPTIONS, snoop=True), live=False, update_s=1.0)
     assert [n for n, _ in looks_of(result, ALONE)] == [str(simulation.points.id[other])]
 
 
