@@ -20,11 +20,13 @@ REACHED_BACK_S = 10.0
 #: A strip whose end nobody tells is over when there has been no image point of it for so long, s, and another one has
 #: begun at least ``LEFT_S`` after the last. Two cameras that image at once begin together; a turn takes longer. Tuned.
 SILENT_S, LEFT_S = 30.0, 10.0
-#: An image point is refused that was imaged so long after the newest message, s: clocks of programs differ by less.
-#: Tuned.
+#: An image point is refused whose line is imaged only so long after the newest message, s: clocks of programs differ
+#: by less. Tuned.
 AHEAD_OF_NOW_S = 60.0
-#: What such a point, and a look that was taken or came too late, is called where it is counted.
-NOT_IMAGED, OF_ITS_STRIP = "not imaged yet", ("", "too late", "point is final", "duplicate")
+#: Why such a point is refused, where it is counted.
+NOT_IMAGED = "not imaged yet"
+#: What the window says ("" where it takes it) of an image point that shows that its strip goes on.
+GOES_ON = "", "too late", "point is final", "duplicate"
 
 
 class AdjustedStrips:
@@ -124,12 +126,12 @@ class AdjustedStrips:
                 self._ahead.add(look.strip)
                 where = f"an image point of {name} in line {look.line:.6g}, which is imaged {ahead_s:.6g} s from now"
                 self.events.append(
-                    f"strip {look.strip}: {where}, is left out, as are others of the kind; what measures it has to "
-                    "count lines from the first of the strip"
+                    f"strip {look.strip}: {where}, is left out, as are others of the kind; lines count from the first "
+                    "of the strip, and a message has the time by which they had been imaged"
                 )
             return NOT_IMAGED
         reason = window.add_look(name, look)
-        if reason in OF_ITS_STRIP and not strip.ended:
+        if reason in GOES_ON and not strip.ended:
             imaged = (now_s - strip.first_line_time_s) * strip.line_rate_hz
             self._looked[look.strip] = max(self._looked.get(look.strip, -1.0), min(look.line, imaged))
         return reason

@@ -14,7 +14,8 @@ other. Those of offset and of shift and drift are weighed where the squared resi
 are significantly more than their redundancy. A factor falls again where the data no longer ask for it, and never below
 1: a trajectory that is stated too good costs much, one that is stated too bad next to nothing. Where that of a wander
 falls, the wander that is present may keep what it had (`kept_wanders`); not where noise of the looks has been found
-larger since, which had been taken for it.
+larger since, which had been taken for it. A strip that begins keeps the factors that earlier ones have shown until it
+has looks of its own, and those of its constant errors longer, since each strip is one sample more of the same sigma.
 
 Noise of the looks (`look_noise`) comes after the trajectory. But few looks with much noise look as if the trajectory
 wandered, and a wander that is stated so large would follow their noise from then on. So before one is stated larger,
