@@ -10,9 +10,9 @@ import numpy as np
 from ...schemas import messages as m
 from ...schemas.units import place_columns
 from .. import convert
-from ..errors import UserError
 from ..formats.table import csv_field
 from ..recording.reader import RecordingReader
+from ..recording.summary import lacking
 
 _SIGMAS = ("sigma_X_m", "sigma_Y_m", "sigma_Z_m")
 
@@ -43,7 +43,7 @@ def write_points(reader: RecordingReader, path: Path, *, covariance: bool = Fals
         ):
             best[body.point] = body
     if not best:
-        raise UserError(f"{reader.path}: no message on point/object: `triline process` makes them")
+        raise lacking(reader, "no message on point/object: `triline process` makes them")
     project = reader.last("configuration/project")
     frame = convert.local_frame(project if project is not None else m.Project())
     xyz = np.array([(p.x, p.y, p.z) for p in best.values()])

@@ -30,6 +30,7 @@ from ..formats.geotiff import Heights
 from ..formats.line_orientation import OrientedLines
 from ..formats.trajectory_csv import Poses, read_poses_of_strips
 from ..recording.access import PoseTable, Recording
+from ..recording.summary import lacking
 from ..voices import VERDICT, RecordedVoices
 
 Array = NDArray[np.floating]
@@ -157,7 +158,7 @@ def orientation_of(recording: Recording, name: str | None) -> tuple[str, LineOri
     if name is None:
         name = next(iter(there), None)
         if name is None:
-            raise UserError(f"{path}: no orientation in it; 'triline process' makes one from sensor data")
+            raise lacking(reader, "no orientation in it; 'triline process' makes one from sensor data")
     if name not in there:
         has = f"it has {', '.join(there)}" if there else "it has none"
         missing = ORIENTATIONS[name].rstrip("/") if measured or name == "measured" else "trajectory"
@@ -274,7 +275,7 @@ def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Ite
     # nodes use no strip without a rate
     strips = {id: strip for id, strip in recording.last_strips().items() if strip.line_rate_hz > 0}
     if not strips:
-        raise UserError(f"{recording.reader.path}: no strip in it, so no lines (configuration/strip)")
+        raise lacking(recording.reader, "no strip in it, so no lines (configuration/strip)")
     of_strip = OfStrips(recording, name, orientation, reference_ns)
 
     def parts() -> Iterator[OrientedLines]:

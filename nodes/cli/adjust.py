@@ -298,8 +298,12 @@ def read_input(path: Path) -> BlockData:
     refuse_importable(path)
     reader = RecordingReader(path, by_ranges=True)
     voices, notes = RecordedVoices(), list[str]()
-    with navigated(reader, path.name, notes) as oriented:
-        block = block_from_messages(voices.all_used(oriented.sorted_messages(TOPICS)), path.name)
+    try:
+        with navigated(reader, path.name, notes) as oriented:
+            block = block_from_messages(voices.all_used(oriented.sorted_messages(TOPICS)), path.name)
+    except UserError as error:
+        lines = damage_lines(reader)
+        raise UserError(f"{error} ({'; '.join(lines)})") if lines else error from None
     damage = (f"damaged recording: {line}" for line in damage_lines(reader))
     return replace(block, notes=(*damage, *notes, *voices.lines(), *block.notes))
 

@@ -47,7 +47,7 @@ from ..formats.smrmsg import write_smrmsg_poses
 from ..node import Message
 from ..recording.access import Recording
 from ..recording.reader import RecordingReader
-from ..recording.summary import damage_lines
+from ..recording.summary import damage_lines, held_topics, lacking
 from .damage import tell_damage, tell_other_frame
 from .outputs import refuse_input_as_output
 
@@ -135,8 +135,7 @@ def run(args: argparse.Namespace) -> int:
             f"--topic {args.topic}: not a topic; topics: {', '.join(t.name for t in topics.TOPICS)}"
         ) from None
     if not len(reader.select([args.topic])):
-        held = sorted({channel.topic for channel in reader.channels.values() if channel.known})
-        raise UserError(f"{path}: no message on {args.topic}; it holds {', '.join(held) or 'no known topic'}")
+        raise lacking(reader, f"no message on {args.topic}; {held_topics(reader)}")
     target = Path(getattr(args, kind))
     with new_file(target) as part:
         count: dict[str, Any] = {**_WRITERS[kind](reader, args, part)}

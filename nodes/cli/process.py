@@ -23,7 +23,7 @@ from ..node import Node
 from ..recording.reader import RecordingReader
 from ..recording.remote import path_of
 from ..recording.runner import ProcessSummary, process
-from ..recording.summary import damage_lines
+from ..recording.summary import damage_lines, held_topics, lacking
 from ..recording.writer import COMPRESSIONS, RecordingWriter
 from .damage import tell_damage
 from .dem_options import add_dem_options, dem_settings
@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
             f"--nodes: no node {other!r} that works on a recording, wanted {', '.join(registry.STEP_NODES)}"
         )
     if ADJUSTER in names and NAVIGATOR not in names and not len(reader.select(POSES)):
-        raise UserError(f"{args.recording}: no message on {' or '.join(POSES)}, wanted {NAVIGATOR} among --nodes, too")
+        raise lacking(reader, f"no message on {' or '.join(POSES)}, wanted {NAVIGATOR} among --nodes, too")
     pace = args.pace or usual_pace(reader, names)
     tables = at_pace(load(args.config, registry.names()), pace)
     dem = dem_settings(args)
@@ -114,9 +114,9 @@ def run(args: argparse.Namespace) -> int:
                 copy=writer.write_recorded,
             )  # fmt: skip
         if not summary.nodes:
-            raise UserError(f"{args.recording}: nothing to process for {args.nodes}: {_held(reader)}")
+            raise lacking(reader, f"nothing to process for {args.nodes}: {held_topics(reader)}")
         if not summary.outputs:
-            raise UserError(f"{args.recording}: nothing came out: {_waiting(summary)}")
+            raise lacking(reader, f"nothing came out: {_waiting(summary)}")
         os.replace(part, args.output)
     except OSError as error:
         raise UserError(f"{args.output}: cannot be written: {(error.strerror or str(error)).lower()}") from None
@@ -179,16 +179,8 @@ def _camera(reader: RecordingReader, path: Path, notes: list[str]) -> bytes:
     """The message of a camera in place of that of the recording; ``notes`` gets remarks."""
     body = reader.last(CAMERA)
     if body is None:
-        raise UserError(f"{reader.path}: no {CAMERA} in it, so --camera has nothing to stand for")
+        raise lacking(reader, f"no {CAMERA} in it, so --camera has nothing to stand for")
     return codec.encode(camera_message(read_camera_instead(path, camera_from(body), notes=notes)))
-
-
-def _held(reader: RecordingReader) -> str:
-    present = set(reader.index.channel.tolist())
-    held = sorted({c.topic for c in reader.channels.values() if c.known and c.id in present})
-    if not held:
-        return f"no message is left of it ({reader.damage[0]})" if reader.damage else "it holds no message"
-    return f"it holds {', '.join(held)}"
 
 
 def _waiting(summary: ProcessSummary) -> str:

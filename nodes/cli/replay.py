@@ -11,10 +11,10 @@ from ..bus.brake import Brake
 from ..bus.program import stop_on_signals
 from ..bus.session import Bus
 from ..convert import iso
-from ..errors import UserError
 from ..formats.json_text import json_text
 from ..player.player import first_stamp_ns, play, time_argument
 from ..recording.reader import RecordingReader
+from ..recording.summary import lacking
 from .bus_options import add_bus_arguments, bus_of, reporter
 from .damage import tell_damage
 from .progress import progress
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     reader = RecordingReader(args.recording)
     if not len(reader.index.stamp_ns):
-        raise UserError(f"{args.recording}: nothing to play: no message in it")
+        raise lacking(reader, "nothing to play: no message in it")
     first = first_stamp_ns(reader)
     report = reporter(args.quiet or args.json)
     stop = threading.Event()

@@ -23,7 +23,7 @@ from .. import convert
 from ..errors import UserError
 from ..node import Message
 from .reader import RecordingReader
-from .summary import topic_summaries
+from .summary import lacking, topic_summaries
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -174,7 +174,7 @@ class Recording:
     def _last(self, topic: str) -> Any:
         body = self.reader.last(self._check(topic))
         if body is None:
-            raise UserError(f"{self.reader.path}: no {topic} in it")
+            raise lacking(self.reader, f"no {topic} in it")
         return body
 
     def _check(self, topic: str) -> str:

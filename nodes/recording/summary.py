@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ...schemas import topics
 from ...schemas.topics import Family
+from ..errors import UserError
 from .reader import RecordingReader
 from .usable import usable
 
@@ -166,6 +167,19 @@ def damage_lines(reader: RecordingReader) -> list[str]:
     if reader.problems["malformed"]:
         lines.append(f"skipped {reader.problems['malformed']} unusable messages; the last: {reader.last_problem}")
     return lines
+
+
+def held_topics(reader: RecordingReader) -> str:
+    """The topics of which a recording has messages, in words."""
+    present = set(reader.index.channel.tolist())
+    held = sorted({c.topic for c in reader.channels.values() if c.known and c.id in present})
+    return f"it holds {', '.join(held)}" if held else "it holds no message"
+
+
+def lacking(reader: RecordingReader, what: str) -> UserError:
+    """The error of a recording in which something is missing, with the damage that may be why."""
+    damage = "; ".join(damage_lines(reader))
+    return UserError(f"{reader.path}: {what}{damage and f' ({damage})'}")
 
 
 def findings(reader: RecordingReader, *, decode: bool = True, outside: bool = True) -> list[str]:

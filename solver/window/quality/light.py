@@ -172,9 +172,9 @@ def sigma0_by_chance(redundancy: int) -> float:
 
 
 def _tie_points(s: QualityFindings) -> tuple[str, str] | None:
-    within = f"within {s.length_s:.0f} s"
+    within = f"within {s.length_s:.0f} s" if s.length_s else "yet"
     if s.points == s.refused:
-        when = "yet" if s.since_s < s.length_s or not s.length_s else within
+        when = "yet" if s.since_s < s.length_s else within
         return WEAK, f"no tie points {when}: the orientation is the measured one"
     if s.tied < LEAST_POINTS:
         return WEAK, f"too few tie points {within}: {s.tied} are seen twice, wanted {LEAST_POINTS}"

@@ -107,9 +107,19 @@ def test_a_recording_whose_head_is_lost_is_refused_with_the_reason(tmp_path, cap
     cut.write_bytes(data[: first[1] - 10])
     code, text, err = run_main(capsys, "process", flipped, "-o", out)
     assert code == 1 and text == "" and "nothing came out: navigator waiting for configuration/project" in err
-    code, text, err = run_main(capsys, "process", cut, "-o", out)
-    assert code == 1 and text == "" and "no message is left of it (the file ends inside a record" in err
-    assert len(err.splitlines()) == 1 and not out.exists() and not list(tmp_path.glob("*.part"))
+    damage = "(skipped 1 damaged place: the file ends inside a record at byte"
+    for *command, lacks in (
+        ("process", cut, "-o", out, "it holds no message"),
+        ("adjust", cut, "no message on configuration/camera; it cannot be adjusted as a block"),
+        ("rectify", cut, "-o", out, "no configuration/camera in it"),
+        ("replay", cut, "nothing to play: no message in it"),
+        ("export", "--per-line", out, cut, "no orientation in it; 'triline process' makes one from sensor data"),
+        ("export", "--points", out, cut, "no message on point/object: `triline process` makes them"),
+        ("export", "--topic", "sensor/gnss", "--csv", out, cut, "no message on sensor/gnss; it holds no message"),
+    ):
+        code, text, err = run_main(capsys, *command)
+        assert code == 1 and text == "" and f"{lacks} {damage}" in err, err
+        assert len(err.splitlines()) == 1 and not out.exists() and not list(tmp_path.glob("*.part"))
     code, text, err = run_main(capsys, "info", cut)
     assert code == 0 and "0 messages" in text and "damaged: the file ends inside a record" in text
     code, text, err = run_main(capsys, "recover", cut, "-o", out)
