@@ -20,13 +20,13 @@ help:
 	@echo "make schemas compile the protobuf files"
 	@echo "make golden  make the golden recording and its results anew"
 
-# A virtual environment with the package, $(1); made again when the dependencies change. pip compiles its byte code on one
-# core, compileall on all.
+# A virtual environment with the package, $(1); made again when the dependencies change. pip compiles byte code on one core
+# and that of the packages' tests, too; what compileall has made none of the processes of a flight or of the tests makes again.
 define install
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --no-compile --editable '$(1)'
-	-@$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib >/dev/null
+	-@$(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib nodes schemas solver >/dev/null
 	@touch $@
 endef
 
