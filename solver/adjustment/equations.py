@@ -207,13 +207,13 @@ class BlockEquations:
             at.linearisation,
             self.points,
             outcome.factor,
-            self.cost,
-            n,
-            u,
             outcome.steps,
             outcome.converged,
             history,
-            assumed_of(at.layout, p.prior, at.state.theta, outcome.factor, p.wide),
+            cost=self.cost,
+            n_observations=n,
+            n_unknowns=u,
+            assumed=assumed_of(at.layout, p.prior, at.state.theta, outcome.factor, p.wide),
         )
 
 

@@ -158,7 +158,7 @@ class Assumed(NamedTuple):
         share = np.clip(1.0 - variance, 0.0, 1.0)
         return cls(round(float(share.sum())), float(residual @ residual))
 
-    def __add__(self, other: Assumed) -> Assumed:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def __add__(self, other: Assumed) -> Assumed:  # pyrefly: ignore[bad-override]  # a sum, not a longer tuple
         return Assumed(self.number + other.number, self.squares + other.squares)
 
 
@@ -187,8 +187,16 @@ def assumed_of_model(unknowns: Layout | Unknowns, prior: Prior, theta: Array, fa
     return Assumed.equations(row_variances(own, factor), prior.value[rows] - own @ theta)
 
 
+@dataclass(frozen=True, kw_only=True)
 class Fitted:
-    """What a solution says of its fit, from its cost and what it counts."""
+    """What a solution says of its fit.
+
+    Attributes
+    ----------
+    cost : sum of squared whitened residuals of rays, control and a-priori observations
+    n_observations, n_unknowns : of those that carry weight / are determined
+    assumed : of the a-priori observations, values that nobody stated; the redundancy is without them
+    """
 
     cost: float
     n_observations: int
@@ -212,7 +220,7 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Solution(Fitted):
-    """Result of an adjustment. Arrays of rays and points are in the network's order.
+    """Result of an adjustment, with its fit. Arrays of rays and points are in the network's order.
 
     Attributes
     ----------
@@ -223,12 +231,9 @@ class Solution(Fitted):
     linearisation : whitened observation equations at the solution, of all rays, without `ray_weight`
     points : factorised point matrices at the solution
     factor : factorised reduced system
-    cost : sum of squared whitened residuals of rays, control and a-priori observations
-    n_observations, n_unknowns : of those that carry weight / are determined
     iterations : number of steps taken
     converged : whether the tolerance was reached
     history : all steps
-    assumed : of the a-priori observations, values that nobody stated; the redundancy is without them
     """
 
     problem: Problem
@@ -238,13 +243,9 @@ class Solution(Fitted):
     linearisation: Linearisation
     points: PointNormals
     factor: Factor
-    cost: float
-    n_observations: int
-    n_unknowns: int
     iterations: int
     converged: bool
     history: tuple[Iteration, ...]
-    assumed: Assumed = NOTHING_ASSUMED
 
     @property
     def network(self) -> Network:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from ..adjustment.nested_dissection import Dissection
 from ..adjustment.network import Strip
 from ..adjustment.normal_equations import Prior, whiten_prior
 from ..adjustment.normal_matrix import NormalMatrix, Structure, find_structure, new_matrix
-from ..adjustment.problem import USUAL, AdjustmentOptions, Assumed, Fitted, Iteration, State, assumed_of
+from ..adjustment.problem import USUAL, AdjustmentOptions, Fitted, Iteration, State, assumed_of
 from ..adjustment.reduced_system import DenseFactor, Factor
 from ..adjustment.robust import WeightFunction
 from ..camera.line_camera import LineCamera
@@ -105,21 +106,16 @@ class PartitionedSolution(Fitted):
     block : what was adjusted
     theta : (n_unknowns,) of the reduced system
     factor : factorised reduced system
-    cost : sum of squared whitened residuals of rays, control and a-priori observations
-    n_observations, n_unknowns, iterations, converged, history, assumed : as in `adjustment.Solution`
+    iterations, converged, history : as in `adjustment.Solution`
     kept : the state of the partitions
     """
 
     block: PartitionedBlock
     theta: Array
     factor: Factor
-    cost: float
-    n_observations: int
-    n_unknowns: int
     iterations: int
     converged: bool
     history: tuple[Iteration, ...]
-    assumed: Assumed
     kept: Kept
 
 
@@ -285,7 +281,7 @@ class PartitionedEquations:
     def refresh(self) -> None:
         """Weights are as they are."""
 
-    def _do(self, **what: object) -> None:
+    def _do(self, **what: Any) -> None:
         if what.keys() != {"reweigh"} or self.changes or what["reweigh"] != (None, 1.0):
             self._cost = None
         self.changes = self.changes._replace(**what)
@@ -302,8 +298,8 @@ class PartitionedEquations:
         u = block.n_unknowns - len(outcome.factor.undetermined) + self.rank
         assumed = assumed_of(block.unknowns, self.prior, self.theta, outcome.factor, wide)
         return PartitionedSolution(
-            block, self.theta, outcome.factor, self.cost, n, u, outcome.steps, outcome.converged, history, assumed,
-            Kept(block, self.version),
+            block, self.theta, outcome.factor, outcome.steps, outcome.converged, history, Kept(block, self.version),
+            cost=self.cost, n_observations=n, n_unknowns=u, assumed=assumed,
         )  # fmt: skip
 
 

@@ -77,7 +77,7 @@ class Engine:
             model,
             self_calibration,
             _layout(block, network.heading),
-            None,  # pyright: ignore[reportArgumentType]  (every partition has its own)
+            None,  # pyrefly: ignore[bad-argument-type]  # every partition has its own
             block.prior,
             weigh_control(network.control, network.n_points),
             parts=self,
@@ -137,14 +137,14 @@ class Engine:
             Linearisation(np.empty((2, 0)), np.empty((2, 6, 0)), np.empty((2, 0, 0)), np.empty((2, 3, 0))),
             PointNormals(nothing, nothing, rank),
             outcome.factor,
-            solved.cost,
-            solved.n_observations,
-            solved.n_unknowns,
             solved.iterations,
             solved.converged,
             history,
-            solved.assumed,
             solved.kept,
+            cost=solved.cost,
+            n_observations=solved.n_observations,
+            n_unknowns=solved.n_unknowns,
+            assumed=solved.assumed,
         )
 
     def _start(self, points_l: Solution | Array | None) -> Array:
