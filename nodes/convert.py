@@ -144,7 +144,9 @@ def pose_message(
 
 def _plain(values: ArrayLike) -> list[float]:
     """Numbers of an array, one after the other; a list of them is taken as it is, which spares half of the time."""
-    return values if type(values) is list else np.asarray(values, dtype=float).ravel().tolist()
+    if isinstance(values, list):
+        return values  # pyrefly: ignore[bad-return]  # flat, of floats
+    return np.asarray(values, dtype=float).ravel().tolist()
 
 
 def check_strip(body: Any, stamp_ns: int) -> None:

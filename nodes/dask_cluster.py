@@ -35,8 +35,8 @@ def connect(address: str, name: str, timeout_s: float | None = None) -> tuple[An
     wait_s = CONNECT_S if timeout_s is None else timeout_s
     try:
         client: Any = distributed.Client(address, timeout=wait_s, set_as_default=False, name=name)
-    except (OSError, TimeoutError, ValueError) as error:
-        what = "nobody answers there" if isinstance(error, OSError | TimeoutError) else str(error)
+    except (OSError, ValueError) as error:  # what takes too long is an OSError, too
+        what = "nobody answers there" if isinstance(error, OSError) else str(error)
         raise UserError(f"--scheduler {address}: {what}, wanted a Dask scheduler") from None
     try:
         wanted = version("triline")

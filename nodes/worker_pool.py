@@ -7,6 +7,7 @@ import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
+from types import TracebackType
 from typing import Any
 
 
@@ -35,8 +36,10 @@ class WorkerPool(ProcessPoolExecutor):
         with _interrupts_held():  # until a new process has begun
             return super().submit(fn, *args, **kwargs)
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self.shutdown(wait=True, cancel_futures=kind is not None)
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc_val: BaseException | None, exc_tb: TracebackType | None
+    ) -> None:
+        self.shutdown(wait=True, cancel_futures=exc_type is not None)
 
 
 def _begin(begin: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:

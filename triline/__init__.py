@@ -24,7 +24,7 @@ def __getattr__(name):
 def open(path):
     """Open a recording for analysis; see `triline.nodes.recording.access.Recording`."""
     # the folder of triline.nodes lies beside this one, where a type checker does not look
-    from .nodes.recording.access import Recording  # pyright: ignore[reportMissingImports]
+    from .nodes.recording.access import Recording
 
     return Recording(path)
 

@@ -125,7 +125,7 @@ class SourceImage:
         from rasterio.enums import Resampling
         from rasterio.windows import Window
 
-        window = Window(sample * factor, line * factor, samples * factor, lines * factor)  # type: ignore[call-arg]
+        window = Window(sample * factor, line * factor, samples * factor, lines * factor)
         if factor > 1 and not self._unstated:
             return self._read(window=window, out_shape=(lines, samples), resampling=Resampling.average)
         pixels = self._read(window=window)

@@ -248,7 +248,7 @@ def layer_of_orthoimage(
     for r in range(0, shape[0], 64):  # the nearest value of each place, a few rows at a time
         high = min(64, shape[0] - r)
         rows = min(high * factor, source.rows - r * factor)
-        window = Window(0, r * factor, source.columns, rows)  # type: ignore[call-arg]
+        window = Window(0, r * factor, source.columns, rows)
         values = about.read(bands, window=window, out_shape=(len(bands), high, shape[1]))
         known[r : r + high] = _valid(values, float("nan") if masked else nodata).all(axis=0)
         if masked:
@@ -266,7 +266,7 @@ def layer_of_orthoimage(
                 h, w = min(PIECE, source.rows - r), min(PIECE, source.columns - c)
                 valid = _valid(_read(source, r, c, h, w), float("nan") if masked else nodata).all(axis=0)
                 if masked:
-                    valid &= about.dataset_mask(window=Window(c, r, w, h)) != 0  # type: ignore[call-arg]
+                    valid &= about.dataset_mask(window=Window(c, r, w, h)) != 0
                 if not valid.any():
                     continue
                 steep = 1.0 + 254.0 * _between(inside, factor, r, c, h, w) / middle
@@ -284,8 +284,8 @@ def layer_of_orthoimage(
     if len(bands) < source.count:
         told["notes"] = ["its alpha band says which cells count, and is no band of the mosaic"]
     return Layer(
-        name, "", str(path), str(steepness), sigma and str(sigma), row, column, source.rows, source.columns,
-        len(bands), dtype.name, float(nodata), sorted(tiles), told,
+        name, "", str(path), str(steepness), None if sigma is None else str(sigma), row, column, source.rows,
+        source.columns, len(bands), dtype.name, float(nodata), sorted(tiles), told,
         descriptions=tuple(text or "" for text in words) if any(words) else (),
         scales=scales if scaled else (), offsets=offsets if scaled else (),
         units=tuple(unit or "" for unit in units) if any(units) else (),
@@ -321,7 +321,7 @@ def _place(path: Path, source: RasterFile, crs: str, gsd: float) -> tuple[int, i
 def _read(source: RasterFile, row: int, column: int, rows: int, columns: int) -> NDArray[Any]:
     from rasterio.windows import Window
 
-    window = Window(column, row, columns, rows)  # type: ignore[call-arg]
+    window = Window(column, row, columns, rows)
     return source.source.read(_grey_bands(source.source), window=window)
 
 

@@ -203,7 +203,9 @@ class Authority:
             digital_signature=True, content_commitment=False, key_encipherment=False, data_encipherment=False,
             key_agreement=False, key_cert_sign=False, crl_sign=False, encipher_only=False, decipher_only=False,
         )  # fmt: skip
-        identifier = x509.AuthorityKeyIdentifier.from_issuer_public_key(self._certificate.public_key())  # type: ignore[arg-type]
+        identifier = x509.AuthorityKeyIdentifier.from_issuer_public_key(
+            self._certificate.public_key()  # pyrefly: ignore[bad-argument-type]  # of an elliptic curve, as is the next
+        )
         certificate = (
             _begun(subject, self._certificate.subject, key.public_key(), days, now)
             .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
@@ -211,7 +213,7 @@ class Authority:
             .add_extension(x509.ExtendedKeyUsage(USES), critical=False)
             .add_extension(x509.SubjectAlternativeName([_alternative(host) for host in listens]), critical=False)
             .add_extension(identifier, critical=False)
-            .sign(self._key, hashes.SHA256())  # type: ignore[arg-type]
+            .sign(self._key, hashes.SHA256())  # pyrefly: ignore[bad-argument-type]
         )  # fmt: skip
         bundle = self.folder / name
         bundle.mkdir(exist_ok=True)

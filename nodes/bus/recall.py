@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from typing import TypeVar
+from typing import Any
 
 from ...schemas import topics
 from ...schemas.envelope import Envelope, RawMessage
 from ..ordering import StreamCheck, order_key
 from .session import KEPT_S, Bus, is_kept
-
-T = TypeVar("T")
 
 #: A program that has not come round for so long stood still, s.
 STOOD_STILL_S = 1.0
@@ -42,7 +40,7 @@ class Recall:
     recalled : how many messages of a flight were asked for again and came; what is latched is not counted
     """
 
-    def __init__(self, bus: Bus, names: Iterable[str], check: StreamCheck[T]) -> None:
+    def __init__(self, bus: Bus, names: Iterable[str], check: StreamCheck[Any]) -> None:
         self._bus, self._names, self._check = bus, tuple(names), check
         self._under_way = tuple(name for name in self._names if not topics.find(name).latched)
         self._opened = len(bus.opened_anew)

@@ -537,7 +537,7 @@ def _error_map(args: argparse.Namespace, sensor: _Sensor) -> ErrorMap | None:
         )
     if not (any(pixel) or height or oriented or rpc_m2 or fit is not None or stated.time_s):
         raise UserError("--sigma: no sigma is known, wanted --height-sigma, --pixel-sigma, --position-sigma or others")
-    sensor_sigmas = Sigmas(position, attitude, stated.time_s, (0.0, 0.0), 0.0)  # type: ignore[arg-type]
+    sensor_sigmas = Sigmas(position, attitude, stated.time_s, (0.0, 0.0), 0.0)
     matching = np.diag(np.square(pixel))
 
     def errors(line: Array, sample: Array, height_m: Array) -> tuple[Array, Array]:

@@ -206,7 +206,7 @@ def _summary(flight: SimulatedFlight, seconds: float, output: str, seed: int, co
     images, strips = simulation.images, simulation.flight.strips
     times = simulation.flight.strip_times_s
     roles = Counter(simulation.points.role.tolist())
-    result = {
+    result: dict[str, Any] = {
         "recording": output,
         "seed": seed,
         "seconds": seconds,

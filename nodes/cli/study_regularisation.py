@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--draws {args.draws}: wanted at least 1")
     if args.plot:
         refuse_unless_file(Path(args.plot))
-    rows = []
+    rows: list[dict[str, Any]] = []
     for (parameters, where), (before, after) in PUBLISHED.items():
         got = conditions(parameters, where)
         rng = np.random.default_rng(args.seed)

@@ -195,7 +195,8 @@ def _sigmas(args: argparse.Namespace, usual: tuple[Any, ...], stated: Sigmas | N
     time_s = time_s if args.time_sigma is None else args.time_sigma
     height = height if args.height_sigma is None else args.height_sigma
     try:
-        return Sigmas(tuple(position), tuple(float(a) for a in attitude), time_s, pixels, height)  # pyright: ignore[reportArgumentType]
+        about_x, about_y, about_z = (float(a) for a in attitude)
+        return Sigmas(tuple(position), (about_x, about_y, about_z), time_s, pixels, height)
     except ValueError:
         raise UserError(
             "--position-sigma, --attitude-sigma, --time-sigma, --pixel-sigma, --height-sigma: wanted numbers of at "

@@ -242,7 +242,7 @@ def read_flight(folder: Path, live: bool | None = None, instead: Instead | None 
         raise UserError(f"{folder}: no {FILE}; `triline new flight {shlex.quote(str(folder))}` writes one")
     file = read_toml(path)
     flight = Flight(folder, options=others.options)
-    tables = {}
+    tables: dict[str, Keys] = {}
     for name in (name for name in _KEYS[""] if name not in ("strips", "sensor")):
         tables[name] = flight.attempt(lambda name=name: file.table(name)) or Keys(path, {}, name)
     strips = flight.attempt(lambda: file.tables("strips")) if file.has("strips") else []

@@ -117,7 +117,7 @@ def write_heights(path: Path, heights: Heights) -> None:
         ) as target:  # fmt: skip
             target.write(heights.z_m.astype(np.float32), 1)
             if heights.above_ellipsoid:
-                target.update_tags(**{_DATUM: "ellipsoid"})
+                target.update_tags(bidx=0, **{_DATUM: "ellipsoid"})
         _refuse_cut(part, path)
 
 
@@ -167,7 +167,7 @@ class Draft:
         """Values (bands, rows, columns) at a place."""
         from rasterio.windows import Window
 
-        window = Window(column, row, values.shape[2], values.shape[1])  # type: ignore[call-arg]
+        window = Window(column, row, values.shape[2], values.shape[1])
         with _told(self._path):
             self._target.write(values, window=window)
 
@@ -176,7 +176,7 @@ class Draft:
         from rasterio.windows import Window
 
         with _told(self._path):
-            return self._target.read(window=Window(column, row, columns, rows))  # type: ignore[call-arg]
+            return self._target.read(window=Window(column, row, columns, rows))
 
 
 @contextmanager
@@ -198,7 +198,7 @@ def tiled_orthoimage(
     import rasterio.shutil
     from rasterio.crs import CRS
 
-    predictor = {} if compress == "none" else {"predictor": "yes"}
+    predictor: dict[str, Any] = {} if compress == "none" else {"predictor": "yes"}
     with new_file(path) as part:
         draft = part.with_suffix(".draft")
         try:
@@ -213,7 +213,7 @@ def tiled_orthoimage(
             with target:
                 if raster.colors:
                     target.colorinterp = raster.colors
-                target.update_tags(**raster.tags)
+                target.update_tags(bidx=0, **raster.tags)
                 for k, text in enumerate(raster.descriptions):
                     target.set_band_description(k + 1, text)
                 if any(scale != 1.0 for scale in raster.scales) or any(raster.offsets):
@@ -369,7 +369,7 @@ def cloud_optimised(path: Path, source: Path, compress: str = "deflate", overvie
     import rasterio.shutil
     from rasterio.errors import NotGeoreferencedWarning
 
-    predictor = {} if compress == "none" else {"predictor": "yes"}
+    predictor: dict[str, Any] = {} if compress == "none" else {"predictor": "yes"}
     with warnings.catch_warnings(), new_file(path) as part, rasterio.Env(GDAL_CACHEMAX=CACHE_MB), _told(path):
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         rasterio.shutil.copy(

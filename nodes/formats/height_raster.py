@@ -358,7 +358,7 @@ def _read(file: RasterFile, row: int, column: int, rows: int, columns: int, thin
     from rasterio.windows import Window
 
     source = file.source
-    window = Window(column, row, columns, rows)  # type: ignore[call-arg]
+    window = Window(column, row, columns, rows)
     shape = None if thin == 1 else (-(-rows // thin), -(-columns // thin))
     try:
         band = source.read(1, window=window, masked=True, out_shape=shape)

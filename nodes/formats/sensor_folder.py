@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -198,8 +198,7 @@ def read_sensor_folder(path: str | Path, platform_file: Path | None = None) -> S
     attitude = _read_attitude(folder / "attitude.csv", notes)
     platform = read_platform(platform_file or folder / "platform.toml", notes)
     if platform.initial is None and attitude is not None and time is not None:
-        initial = _initial_of(attitude, float(time.min()))
-        platform = Platform(**{**vars(platform), "initial": initial})
+        platform = replace(platform, initial=_initial_of(attitude, float(time.min())))
     file = rtklib.name if rtklib.is_file() else SensorFolder.gnss_file
     return SensorFolder(folder, time, rotation, force, increments, gnss, attitude, platform, notes, gnss_file=file)
 

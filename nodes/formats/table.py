@@ -189,7 +189,7 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
             **text,
             **exact,
         )
-    except (ValueError, pd.errors.ParserError):  # pandas does not say where, so every line is checked
+    except ValueError:  # pandas does not say where, so every line is checked
         raise UserError(
             one_line(_problems(path, known) or [_not_utf8(path) or f"{path}: cannot be read as CSV"])
         ) from None

@@ -27,7 +27,7 @@ class TiffImage(ImageFile):
         from rasterio.errors import RasterioError
         from rasterio.windows import Window
 
-        window = Window(0, first, self.samples, count)  # pyright: ignore[reportCallIssue]
+        window = Window(0, first, self.samples, count)
         try:
             return self.file.source.read(band + 1, window=window)
         except RasterioError as error:

@@ -121,7 +121,7 @@ class Matcher(Node):
         self._refused: set[str] = set()  # of which an operator said that they do not count
         self._frame_of: Any = None  # the project whose local frame poses and control are in
         self._origin_m = 0.0  # height of the local frame's origin
-        self._mounting = 0, np.eye(3)  # of the camera, as `convert.mounting_of` tells it
+        self._mounting: tuple[int, np.ndarray] = 0, np.eye(3)  # of the camera, as `convert.mounting_of` tells it
         self._failed = 0  # places of the strip that came to nothing; -1 once a tie is found or it has been told
         self._ground_unknown = False  # when they were counted
         self._delay_ns = round(delay_s * convert.SECOND_NS)

@@ -208,7 +208,7 @@ def screen(overview: Overview, title: str, watch: SensorWatch | None = None) -> 
         ("problems", "left"),
     ):
         room = 1 if name == "state" else None  # gives way where the terminal is narrow
-        nodes.add_column(name, justify=justify, no_wrap=True, ratio=room)  # pyright: ignore[reportArgumentType]
+        nodes.add_column(name, justify=justify, no_wrap=True, ratio=room)
     for name in sorted(overview.nodes):
         s = overview.nodes[name]
         bad = {k: sum(getattr(t, k) for t in s.topics) for k in LOSSES}
@@ -258,7 +258,7 @@ def _sensor_table(watch: SensorWatch) -> Any:
     table = Table(box=None, pad_edge=False, expand=True)
     for name, justify in (("sensor", "left"), ("rate", "right"), ("messages", "right"), ("", "left")):
         room = None if name else 1
-        table.add_column(name, justify=justify, no_wrap=True, ratio=room)  # pyright: ignore[reportArgumentType]
+        table.add_column(name, justify=justify, no_wrap=True, ratio=room)
     for row in watch.rows():
         style = {"comes in": "green", "stopped": "bold red"}.get(row.state, "yellow")
         rate = f"{row.rate_hz:.1f}/s" if row.state == "comes in" else "-"

@@ -90,7 +90,7 @@ class InertialUnit:
 
 
 def inertial_engine(
-    project: Any, first_sample: Any, unit: InertialUnit = InertialUnit(), **options: float
+    project: Any, first_sample: Any, unit: InertialUnit = InertialUnit(), **options: Any
 ) -> InertialNavigator:
     """The engine for raw inertial data; its noise is what the first sample says, of a MEMS unit where it says nothing.
 
@@ -113,5 +113,5 @@ def inertial_engine(
     x, y, z = (float(v) for v in camera)
     mount = CameraMount((x, y, z), convert.R_bc_of(project))
     limit = float(np.hypot(OnlineOptions.valid_position_m, slow.position_sigma.max()))
-    answer = OnlineOptions(**{"offset_sigma_m": slow.offset_m, "valid_position_m": limit, **options})  # pyright: ignore
-    return InertialNavigator(convert.local_frame(project), settings, mount, answer)
+    options = {"offset_sigma_m": slow.offset_m, "valid_position_m": limit, **options}
+    return InertialNavigator(convert.local_frame(project), settings, mount, OnlineOptions(**options))

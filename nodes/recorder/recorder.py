@@ -259,7 +259,7 @@ class Recorder(Node):
         self._file = RecordingFile(path, self._bundle)
         try:
             self._writer = RecordingWriter(
-                self._file,  # type: ignore[arg-type]
+                self._file,  # pyrefly: ignore[bad-argument-type]  # has what the writer asks of a file
                 self._compression,
                 platform=self.platform,
                 every=self.every,

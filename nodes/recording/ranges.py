@@ -104,7 +104,7 @@ class Ranged:
         begin, end = chunk.chunk_start_offset, chunk.chunk_start_offset + chunk.chunk_length
         self.file.fetch(begin, end)
         record = scan.parse(self.file.buffer[begin:end])
-        return scan.chunk_content(record)  # type: ignore[arg-type]
+        return scan.chunk_content(record)  # pyrefly: ignore[bad-argument-type]  # the index says that it is a chunk
 
     @property
     def _packed(self) -> NDArray[np.bool_]:

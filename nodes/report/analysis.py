@@ -37,7 +37,7 @@ def analyse(flight: Flight, held: Holdings) -> dict[str, Any]:
     ``rejected_observations`` (the largest first), ``latency_s`` (median, max), ``integrity`` (see
     `integrity.integrity`; absent where no report has a light), ``tracks`` (see `tracks.tracks`), ``events``
     """
-    result = {"recording": _recording(flight, held), "damage": held.damage, "not_used": flight.not_used}
+    result: dict[str, Any] = {"recording": _recording(flight, held), "damage": held.damage, "not_used": flight.not_used}
     result |= evaluate_flight(flight)
     result["topics"] = {
         row.topic: {

@@ -232,7 +232,7 @@ def progress(flight: Flight) -> Figure | None:
     redundancy = np.array([r.redundancy for r in reports])
     telling = redundancy >= _TELLING  # with a few rays sigma0 says nothing and would set the scale
     sigma0 = np.where(telling, [r.sigma0 for r in reports], np.nan)
-    low, high = np.sqrt(chi2.ppf([[0.025], [0.975]], np.maximum(redundancy, 1)) / np.maximum(redundancy, 1))
+    low, high = np.sqrt(chi2.ppf(np.array([[0.025], [0.975]]), np.maximum(redundancy, 1)) / np.maximum(redundancy, 1))
     band = {"color": "#d9e2ef", "label": "95 % band of the redundancy", "lw": 0}
     top.fill_between(t, np.where(telling, low, np.nan), np.where(telling, high, np.nan), **band)
     top.axhline(1.0, color="black", lw=0.8)

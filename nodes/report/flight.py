@@ -275,7 +275,7 @@ def collect(messages: Iterable[Message]) -> Flight:
                     fixed_ns.append(used.stamp_ns)
                 elif used.topic == VERDICT and used.body.topic == "sensor/gnss":  # others are the voices' own
                     clock.append(used)
-            except (ValueError, IndexError, np.linalg.LinAlgError):
+            except (ValueError, IndexError):
                 flight.refused[used.topic] += 1
     times = np.array([convert.time_ns(fix.timestamp) for fix in flight.gnss], dtype=np.int64)
     flight.gnss_ns = times + np.rint(added_to_times(fixed_ns, clock) * convert.SECOND_NS).astype(np.int64)

@@ -81,7 +81,7 @@ class Sensor(Node):
 
     def __init__(self, id: str) -> None:
         super().__init__()
-        self.name = id  # type: ignore[misc]  # several of one class
+        self.name = id  # pyrefly: ignore[read-only]  # several of one class
         self.published = 0
         self.from_begin = False
         #: White noise of the inertial unit, rad/sqrt(s) and m/s/sqrt(s), for samples that do not state theirs.

@@ -137,7 +137,8 @@ def world_from(terms: Iterable[Any]) -> World:
             raise UserError(f"true {name}: given twice, wanted once")
         try:
             value = key.read(text.strip())
-            replace(AS_STATED, **{key.field: (value,) if key.many else value})
+            changed: dict[str, Any] = {key.field: (value,) if key.many else value}
+            replace(AS_STATED, **changed)
         except ValueError as error:
             said = str(error).removeprefix("true world: ")
             why = f" ({said})" if str(error).startswith("true world") else ""

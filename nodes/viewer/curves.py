@@ -244,4 +244,5 @@ def entity_name(text: str) -> str:
 def _palette(k: int) -> Color:
     """Colours that differ for neighbouring numbers."""
     hues = ((230, 90, 80), (90, 200, 120), (90, 150, 250), (240, 200, 70), (200, 110, 240), (90, 220, 220))
-    return (*hues[k % len(hues)], 255)
+    red, green, blue = hues[k % len(hues)]
+    return red, green, blue, 255

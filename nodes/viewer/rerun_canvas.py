@@ -232,7 +232,10 @@ def fleet_blueprint(layout: FleetLayout) -> rrb.Blueprint:
             x_range=[-30.0, 60.0], y_range=[-layout.row, layout.row * max(len(layout.aircraft), 2)]
         ),
     )
-    side = [rrb.TextDocumentView(origin="/about", name="Why"), rrb.TextLogView(origin="/log", name="Events")]
+    side: list[rrb.View] = [
+        rrb.TextDocumentView(origin="/about", name="Why"),
+        rrb.TextLogView(origin="/log", name="Events"),
+    ]
     if layout.geographic_centre is not None:
         girth = 40_075_017.0 * np.cos(np.radians(layout.geographic_centre[0]))
         zoom = float(np.log2(girth * _MAP_POINTS / 256 / max(reach, 100.0)))

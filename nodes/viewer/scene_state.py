@@ -348,5 +348,5 @@ def forward(quaternion: Array) -> Array:
 
 def round_number(value: float) -> float:
     """The nearest of 1, 2, 5, 10, 20, ..., as ratios go."""
-    power = 10.0 ** np.floor(np.log10(max(value, 1e-9)))
-    return float(min((f * power for f in (1, 2, 5, 10)), key=lambda f: abs(np.log(f / max(value, 1e-9)))))
+    power = float(10.0 ** np.floor(np.log10(max(value, 1e-9))))
+    return min((f * power for f in (1, 2, 5, 10)), key=lambda f: abs(np.log(f / max(value, 1e-9))))

@@ -62,8 +62,9 @@ class BlockNormals:
     def __init__(self) -> None:
         self._row: dict[int, int] = {}  # of a cell in the arrays of its unknowns
         self._slot: dict[tuple[int, int], int] = {}  # of two cells, the later one first, among the blocks
-        self._rhs, self._known = np.zeros((ROOM, CELL)), np.zeros((ROOM, CELL), dtype=bool)
-        self._blocks = np.zeros((ROOM, CELL, CELL))
+        self._rhs: Array = np.zeros((ROOM, CELL))
+        self._known: Bools = np.zeros((ROOM, CELL), dtype=bool)
+        self._blocks: Array = np.zeros((ROOM, CELL, CELL))
         self._free_rows: list[int] = list(range(ROOM - 1, -1, -1))
         self._free_slots: list[int] = list(range(ROOM - 1, -1, -1))
 
@@ -282,7 +283,7 @@ class BlockNormals:
             self._free_rows.append(self._row.pop(cell))
 
 
-def _larger(array: Array) -> Array:
+def _larger(array: np.ndarray) -> np.ndarray:
     """The same with more room."""
     found = np.zeros((int(GROWTH * len(array)) + 1, *array.shape[1:]), dtype=array.dtype)
     found[: len(array)] = array

@@ -146,7 +146,7 @@ class Layout:
         """Image displacement (2, n) in mm by the additional parameters; 0.0 without self-calibration."""
         return self.camera.evaluate(theta[self.n_model :], rays) if self.camera else 0.0
 
-    def fitted(self, xy_mm: Array, shift: RayShift) -> Layout:
+    def fitted(self, xy_mm: Array, shift: RayShift | None) -> Layout:
         """The same unknowns, additional parameters that act at image coordinates (2, n), and rays elsewhere."""
         assert self.camera is not None
         return replace(self, camera=replace(self.camera, xy_mm=xy_mm), shift=shift)

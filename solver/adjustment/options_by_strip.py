@@ -23,7 +23,7 @@ class OptionsByStrip(ModelOptions):
     options: Mapping[str, ModelOptions]
 
     @property
-    def name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def name(self) -> str:  # pyrefly: ignore[bad-override]  # of one class, not of all
         """How the command line calls the model."""
         return next(iter(self.options.values())).name
 

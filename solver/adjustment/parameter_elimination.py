@@ -213,8 +213,8 @@ def eliminate(
     removed: list[Removal] = []
     kept: dict[str, str] = {}
     while solution.layout.n_camera:
-        known: Reduced | None = Reduced.of(solution)
-        left, gone = known, list[str]()
+        left, gone = Reduced.of(solution), list[str]()
+        known: Reduced | None = left
         while known is not None:
             left = known
             verdict = examine(known.evidence, limits)

@@ -198,7 +198,7 @@ class PoseNoise:
     def __init__(self, trajectory: MeasuredTrajectory) -> None:
         self._trajectory = trajectory
         self._pieces: dict[int, Array] = {}
-        self.usual = np.eye(6)
+        self.usual: Array = np.eye(6)
         self.version = 0
         self.vibration = 0.0
 

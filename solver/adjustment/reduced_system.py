@@ -14,7 +14,7 @@ from ..arrays import Array, Bools, IntArray
 
 Blocks = list[Array]
 
-_potrf, _potri, _potrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=float)
+_potrf, _potri, _potrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=float)  # pyrefly: ignore[not-iterable]
 
 #: Eigenvalues of the scaled matrix below this are taken as zero: where only its own diagonal is known for a scale, and
 #: where that before the points were eliminated is, of which elimination leaves rounding.

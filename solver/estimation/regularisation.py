@@ -13,7 +13,7 @@ in; both are told.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -257,7 +257,7 @@ def iterate(
         change = np.abs(step.x - x) / np.maximum(step.sigma, np.finfo(float).tiny)
         x = step.x
         if change.max() < last_step:
-            return Regularised(**{**step.__dict__, "iterations": k + 1})
+            return replace(step, iterations=k + 1)
     raise ValueError(f"no convergence in {_MOST_STEPS} steps")
 
 

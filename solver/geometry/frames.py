@@ -190,7 +190,8 @@ class LocalFrame:
             circle = _circle(parsed)
             if np.ptp(xyz[:, 0]) > 0.5 * circle:  # on both sides of the date line
                 xyz[:, 0] %= circle
-        lon, lat, _ = _transformer(parsed).transform(*np.mean(xyz, axis=0))
+        x, y, z = np.mean(xyz, axis=0)
+        lon, lat, _ = _transformer(parsed).transform(x, y, z)
         if not np.isfinite([lon, lat]).all():
             raise CrsError(f"coordinates outside the area of {crs!r}")
         return cls(round(float(lat), 6), round(float((lon + 180.0) % 360.0 - 180.0), 6), 0.0, crs)

@@ -36,7 +36,7 @@ class GrowingTrajectory(Trajectory):
 
     def __init__(self) -> None:
         self._size = self._start = self._sloped = 0
-        self._buffer = {
+        self._buffer: dict[str, Array] = {
             "time_s": np.empty(64),
             "position_l": np.empty((64, 3)),
             "quaternion": np.empty((64, 4)),

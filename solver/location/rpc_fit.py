@@ -39,8 +39,11 @@ _WIDER = 1.0 + 1e-6
 class LocationModel(Protocol):
     """Any model with direct location."""
 
-    lines: int
-    samples: int
+    @property
+    def lines(self) -> int: ...
+
+    @property
+    def samples(self) -> int: ...
 
     def direct(self, line: ArrayLike, sample: ArrayLike, height_m: ArrayLike) -> Array:
         """Latitude, longitude (radians) and height, (n, 3)."""

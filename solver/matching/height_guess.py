@@ -64,7 +64,7 @@ class HeightGuess:
         if not self.some:
             return np.full(len(xy), self.prior_m), np.full(len(xy), self.prior_sigma_m)
         tree = self._tree = self._tree or KDTree(self._points[:, :2])
-        d, near = tree.query(xy, k=min(NEIGHBOURS, len(self._points)))
+        d, near = map(np.asarray, tree.query(xy, k=min(NEIGHBOURS, len(self._points))))
         z = self._points[near, 2]
         w = 1.0 / (d + 1e-3 * d.max() + 1e-6) ** 2
         w /= w.sum(axis=1, keepdims=True)

@@ -38,7 +38,7 @@ from .base import (
 from .gauss_markov import damping_rate, over_step, second_order_gauss_markov
 from .slow_errors import SlowErrors
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 IntArray = NDArray[np.int_]
 
 #: A-priori sigma in place of zero, share of a metre or radian: an error that is said not to exist.

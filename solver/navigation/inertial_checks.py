@@ -254,7 +254,7 @@ def _named_axes(M: Array) -> str:
 
 
 def _rotations() -> list[Array]:
-    out = []
+    out: list[Array] = []
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             M = np.zeros((3, 3))

@@ -130,7 +130,7 @@ class PoseMaker:
         self._R_ln = np.eye(3)
         self._at_rpy = np.full(3, np.inf)
         self._of_cov: Array | None = None
-        self._cov_opk = np.zeros((3, 3))
+        self._cov_opk: Array = np.zeros((3, 3))
 
     def R_lb(self, position_l: Array, rpy: Array) -> Array:
         """Body to local (3, 3)."""

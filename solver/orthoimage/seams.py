@@ -138,7 +138,7 @@ def _expanded(labels: IntArray, alpha: int, may: Mask, own: IntArray, seam: IntA
     head = np.concatenate([*heads, dear, np.full(len(cheap), sink)])
     capacity = np.minimum(np.concatenate([*capacities, change[dear], -change[cheap]]), MOST_COST).astype(np.int32)
     graph = csr_array((capacity, (tail, head)), shape=(n + 2, n + 2))
-    left = graph - maximum_flow(graph, source, sink).flow
+    left = csr_array(graph - maximum_flow(graph, source, sink).flow)
     left.eliminate_zeros()
     left.data = (left.data > 0).astype(np.int32)
     left.eliminate_zeros()

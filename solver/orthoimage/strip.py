@@ -183,8 +183,8 @@ class StripRectifier:
         self._first = 0  # number of the first line at hand
         self._pixels = np.empty((0, rays.pixels), dtype=np.uint16)
         self._usable = np.empty(0, dtype=bool)
-        self._cells = np.empty((0, len(rays.sample), 2))
-        self._place = np.empty((0, len(rays.sample), 2))
+        self._cells: Array = np.empty((0, len(rays.sample), 2))
+        self._place: Array = np.empty((0, len(rays.sample), 2))
         self._sigma = np.empty((0, len(rays.sample), 2), dtype=np.float32)
         self._slope = np.empty((0, len(rays.sample), 2), dtype=np.float32)
         self._done = 0  # places p below are rectified

@@ -18,7 +18,7 @@ from scipy.sparse import csr_array
 from ..adjustment.covariance import cofactors
 from ..adjustment.direct_georeferencing import georeference_posed
 from ..adjustment.equations import BlockEquations, Outcome, Reached
-from ..adjustment.layout import layout_of, sets_of_rays
+from ..adjustment.layout import RayShift, layout_of, sets_of_rays
 from ..adjustment.linearisation import Linearisation, Whitening
 from ..adjustment.network import Network
 from ..adjustment.normal_equations import PointNormals, whiten_prior
@@ -136,13 +136,13 @@ class _Saved(NamedTuple):
     g: Array
     linearisation: Linearisation
     camera: Array | None
-    shift: object
+    shift: RayShift | None
     given: Array
     weight: Array
     control: Array
     keep_weights: bool
     points: PointNormals | None
-    trial: tuple[State, Array | None, Linearisation, Array | None, object] | None
+    trial: tuple[State, Array | None, Linearisation, Array | None, RayShift | None] | None
 
 
 def extents(store: Store, key: int) -> Extents:
@@ -458,7 +458,7 @@ def _load(store: Store, key: int, version: int) -> tuple[Part, BlockEquations]:
     equations.keep_weights, equations.weights_given = saved.keep_weights, True
     layout = part.problem.layout
     if saved.camera is not None:
-        layout = layout.fitted(saved.camera, saved.shift)  # pyright: ignore[reportArgumentType]
+        layout = layout.fitted(saved.camera, saved.shift)
     whitening = Whitening(saved.g)
     equations.at = Reached(saved.state, whitening, saved.linearisation, layout)
     equations.points, equations.trial = saved.points, None
@@ -466,6 +466,6 @@ def _load(store: Store, key: int, version: int) -> tuple[Part, BlockEquations]:
     if saved.trial is not None:
         state, g, lin, xy_mm, shift = saved.trial
         weights = whitening if g is None else Whitening(g)
-        place = layout if xy_mm is None else layout.fitted(xy_mm, shift)  # pyright: ignore[reportArgumentType]
+        place = layout if xy_mm is None else layout.fitted(xy_mm, shift)
         equations.retry(Reached(state, weights, lin, place))
     return part, equations

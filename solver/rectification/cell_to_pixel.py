@@ -109,7 +109,7 @@ def node_grid(tile: Tile, count: int) -> tuple[Array, Array]:
     """Columns and rows (k, m), (k, m) of the nodes of a tile."""
     rows = tile.row + places(tile.rows, min(count, tile.rows))
     columns = tile.column + places(tile.columns, min(count, tile.columns))
-    return tuple(np.meshgrid(columns, rows))  # type: ignore[return-value]
+    return tuple(np.meshgrid(columns, rows))
 
 
 def heights_of_tile(tile: Tile, where: CellPlaces, terrain: Terrain, reach: float = 0.0) -> HeightsOfTile | None:
@@ -343,10 +343,10 @@ def _dense(tile: Tile, values: Array, levels: Array, height: Float32 | None) -> 
     return Pixels(coordinates[0], coordinates[1], (int(origin[0]), int(origin[1])), height, count)
 
 
-def _flat_or_dense(values: Array, tile: Tile) -> Float32:
+def _flat_or_dense(values: Array, tile: Tile) -> Float32 | np.float32:
     middle = 0.5 * (values.max() + values.min())
     if np.abs(values - middle).max() < 0.1 * TOLERANCE_PX:
-        return np.float32(middle)  # type: ignore[return-value]
+        return np.float32(middle)
     return over_tile(values, tile.rows, tile.columns)
 
 

@@ -55,7 +55,7 @@ class Sampler:
         """Values (n,) of a band, an array of the shape; single precision, or double for 32-bit integers and doubles."""
         flat: NDArray[Any] = band.ravel()
         if self.method == "nearest":
-            return flat.take(self._at, mode="clip")  # type: ignore[return-value]
+            return flat.take(self._at, mode="clip")
         single = band.dtype.itemsize <= 2 or band.dtype == np.float32
         kind = np.dtype(np.float32) if single else np.dtype(np.float64)
         if self.method == "bilinear":
@@ -141,7 +141,7 @@ def resampled(
     n = len(line)
     if n > PORTION:
         return _in_portions(bands, valid, line, sample, method)
-    sampler = Sampler(line, sample, bands[0].shape, method)  # type: ignore[arg-type]
+    sampler = Sampler(line, sample, bands[0].shape, method)
     values: list[NDArray[np.floating]] = []
     known: list[Mask | None] = []
     nearest: Sampler | None = None
@@ -150,7 +150,7 @@ def resampled(
             values.append(sampler.values(band))
             known.append(None)
             continue
-        nearest = nearest or Sampler(line, sample, band.shape, "nearest")  # type: ignore[arg-type]
+        nearest = nearest or Sampler(line, sample, band.shape, "nearest")
         there = nearest.values(good).astype(bool)
         close = nearest.values(band)
         if method != "nearest":

@@ -107,11 +107,11 @@ def consistency(
         passed.append(global_test(of_image, round(redundancy)).passed)
         if progress:
             progress((seed + 1) / seeds)
-    low, high = stats.chi2.ppf([0.025, 0.975], seeds * unknowns) / (seeds * unknowns)
+    low, high = np.divide(stats.chi2.ppf([0.025, 0.975], seeds * unknowns), seeds * unknowns)
     ratio = np.sqrt(squares.mean(axis=0) / stated.mean(axis=0))
     # of a ratio of means, by the scatter of its blocks; half of that for the root
     scatter = np.std(squares - ratio**2 * stated, axis=0, ddof=min(1, seeds - 1)) / np.sqrt(seeds)
-    least, most = stats.binom.ppf([0.025, 0.975], seeds, 0.95) / seeds
+    least, most = np.divide(stats.binom.ppf([0.025, 0.975], seeds, 0.95), seeds)
     return Consistency(
         ratio,
         scatter / (2.0 * ratio * stated.mean(axis=0)),

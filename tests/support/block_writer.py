@@ -98,7 +98,7 @@ def _write_trajectories(folder: Path, block: BlockData) -> None:
     if any(lens):
         columns["lens"] = np.repeat(lens, own)
     formats = _place_formats(block) | {"time_s": ".9f"} | dict.fromkeys(("omega_deg", "phi_deg", "kappa_deg"), ".9f")
-    write_table(folder / "trajectory.csv", columns, formats)  # type: ignore[arg-type]
+    write_table(folder / "trajectory.csv", columns, formats)
 
 
 def _place_formats(block: BlockData) -> dict[str, str]:
@@ -122,7 +122,7 @@ def _write_ground_points(folder: Path, block: BlockData) -> None:
         columns["target_radius_m"] = ground.target_radius_m
     formats = _place_formats(block) | dict.fromkeys(("sigma_X_m", "sigma_Y_m", "sigma_Z_m"), ".6f")
     formats["target_radius_m"] = ".6g"
-    write_table(folder / "ground_points.csv", columns, formats)  # type: ignore[arg-type]
+    write_table(folder / "ground_points.csv", columns, formats)
 
 
 def _write_image_points(folder: Path, block: BlockData) -> None:

@@ -87,7 +87,7 @@ def write_flight(folder: Path, **settings) -> dict[str, int]:
         x, y, z = to_utm.transform(lon, lat, height)
         lines.append(f"{point},{x:.4f},{y:.4f},{z:.4f},0.05,0.05,0.08,control")
     (flight / "control.csv").write_text("\n".join(lines) + "\n")
-    return {**counts, "blocks": json.loads(json.dumps({ccd: len(parts) for ccd, parts in blocks.items()}))}  # type: ignore[dict-item]
+    return {**counts, "blocks": json.loads(json.dumps({ccd: len(parts) for ccd, parts in blocks.items()}))}
 
 
 def write_rows(drivers: Path, path: Path) -> int:

@@ -106,7 +106,7 @@ class EarlierStrips:
         self._patch_of: dict[str, Patch] = {}
         self._points: dict[str, EarlierPoint] = {}  # of patches whose modes are known
         self._shared_root: Root | None = None
-        self._shared_values = np.zeros(len(shared_columns))
+        self._shared_values: Array = np.zeros(len(shared_columns))
 
     def __len__(self) -> int:
         """Points that a later strip may see again."""

@@ -16,7 +16,7 @@ from ...arrays import Array
 from ..state.strip import WindowStrip
 from ..state.unknowns import WindowState, block_of
 
-(_trtrs,) = get_lapack_funcs(("trtrs",), dtype=float)
+(_trtrs,) = get_lapack_funcs(("trtrs",), dtype=float)  # pyrefly: ignore[not-iterable]
 
 #: Factors that are weighed against each other, and how far from 1 they usually are, as a logarithm. Tuned.
 BANK, USUAL_LOG = (1.0, 1.5, 2.3, 3.5, 5.5, 9.0, 15.0, 30.0, 60.0), 1.5

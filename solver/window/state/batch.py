@@ -184,7 +184,7 @@ class Batch:
         above = np.sort(self.rays.position_l[:, 2] - self.points_l[self.rays.point, 2])
         self.height_m = abs(float(0.5 * (above[(len(above) - 1) // 2] + above[len(above) // 2])))
         self.first_ray = np.searchsorted(self.rays.point, np.arange(self.n_points + 1))
-        self.surface_factor = np.ones(self.n_points)
+        self.surface_factor: Array = np.ones(self.n_points)
         self._template()
 
     def linearise(self, theta: Array, reweigh: bool) -> None:

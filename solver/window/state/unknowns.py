@@ -14,7 +14,7 @@ from ...arrays import Array, Bools, IntArray
 
 #: Weight of what is held, which makes its cofactors nothing.
 HELD_WEIGHT = 1e30
-(_potrf,) = get_lapack_funcs(("potrf",), dtype=float)
+(_potrf,) = get_lapack_funcs(("potrf",), dtype=float)  # pyrefly: ignore[not-iterable]
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,8 @@ class WindowState:
         self.theta: Array = np.empty(0)
         self._next = 0
         self._place = np.full(256, -1, dtype=np.int64)
-        self._fixed, self._live = np.zeros((0, 0)), np.zeros((0, 0))
+        self._fixed: Array = np.zeros((0, 0))
+        self._live: Array = np.zeros((0, 0))
         self._fixed_rhs, self._live_rhs = np.empty(0), np.empty(0)
         self.square = 0.0
         self.redundancy = 0

@@ -118,11 +118,11 @@ def test_a_flight_tells_on_its_screen_that_its_certificate_expires(authority, mo
     bundle = load_bundle(authority.folder / "ann")
     said: list[str] = []
     flight = SimpleNamespace(expiry=ExpiryWatch(bundle), watch=SimpleNamespace(tell=said.append))
-    LiveFlight._tell_expiry(flight)  # type: ignore[arg-type]
+    LiveFlight._tell_expiry(flight)
     assert not said
     flight.expiry.bundle = replace(bundle, until=datetime.datetime.now(datetime.UTC) + datetime.timedelta(minutes=50))
-    LiveFlight._tell_expiry(flight)  # type: ignore[arg-type]
-    LiveFlight._tell_expiry(flight)  # type: ignore[arg-type]
+    LiveFlight._tell_expiry(flight)
+    LiveFlight._tell_expiry(flight)
     assert len(said) == 1 and "'ann' expires on 20" in said[0]
 
 

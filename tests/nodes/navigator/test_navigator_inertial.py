@@ -115,7 +115,7 @@ def messages_of(seed: int, grade=TACTICAL, seconds: float = 75.0, **plan: float)
     """The first seconds of a simulated flight, up to the middle of the turn, and the truth."""
     flight = FlightPlan(strips=2, strip_s=15.0, lead_in_s=20.0)
     simulation = simulate(
-        flight, seed, ErrorModel(gnss_rate_hz=2.0, **plan), inertial=InertialPlan(grade, 50.0)  # pyright: ignore
+        flight, seed, ErrorModel(gnss_rate_hz=2.0, **plan), inertial=InertialPlan(grade, 50.0)
     )  # fmt: skip
     end = EPOCH + round(seconds * 1e9)
     every = Simulator(simulation).messages(EPOCH)
@@ -327,7 +327,7 @@ def test_an_outage_is_told_once_the_pose_is_too_uncertain_and_ends_with_it():
 
 @pytest.mark.study
 def test_slow_gnss_errors_of_many_metres_do_not_make_every_pose_invalid():
-    messages, _ = messages_of(5, seconds=40.0, offset_sigma_m=(8.0, 8.0, 12.0))  # pyright: ignore[reportArgumentType]
+    messages, _ = messages_of(5, seconds=40.0, offset_sigma_m=(8.0, 8.0, 12.0))
     poses = [o.body for o in run(Navigator(), messages) if o.topic == "trajectory/filtered"]
     assert poses[-1].valid and np.reshape(poses[-1].covariance, (6, 6))[2, 2] > 100.0
 

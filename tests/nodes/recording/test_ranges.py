@@ -135,7 +135,7 @@ def test_damage_at_the_end_never_gives_wrong_messages(flown, tmp_path):
 def test_a_file_that_became_shorter_is_told(flown, tmp_path):
     path = tmp_path / "shrinks.mcap"
     path.write_bytes(flown.read_bytes())
-    file = RemoteFile(path_of(url_of(path)))  # type: ignore[arg-type]
+    file = RemoteFile(path_of(url_of(path)))
     path.write_bytes(b"x" * 10)
     with pytest.raises(UserError, match="did it change"):
         file.fetch(0, 3 * PAGE)

@@ -100,7 +100,7 @@ def test_a_router_thins_out_by_numbers_and_lets_images_on_board():
     assert len(sent) == 42
     with pytest.raises(ValueError, match="stays on board"):
         parameters = {"topic": "sensor/lines/F", "source": "s", "start": "1", "runs": "0-5", "every": "1"}
-        list(router.answer(None, "recorded", parameters))  # pyright: ignore[reportArgumentType]  # nobody is asked
+        list(router.answer(None, "recorded", parameters))  # nobody is asked
     with pytest.raises(ValueError, match="bytes_s"):
         OnBoardRouter(-1.0)
 
