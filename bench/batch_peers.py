@@ -90,12 +90,12 @@ def write_problem(path: Path, problem, whitening) -> None:
         for c, (block, k) in place.items():
             weights[block][k] = 1.0 / sigma[c]
         for block, w in weights.items():
-            kind, index = (2, 0) if block == "common" else (3, block)
+            kind, index = (3, block) if isinstance(block, int) else (2, 0)
             linear.append((kind, (index,), np.diag(w), np.zeros(len(w))))
     control = problem.control
     for i in np.flatnonzero(control.weight.any(axis=1)):
         w = np.sqrt(control.weight[i])
-        linear.append((1, (i,), np.diag(w), w * control.xyz_l[i]))
+        linear.append((1, (int(i),), np.diag(w), w * control.xyz_l[i]))
     with open(path, "wb") as file:
         head = [model, layout.n_model // size, size, n_lines, network.n_points, n, len(linear)]
         np.array(head, dtype=np.int64).tofile(file)

@@ -61,7 +61,9 @@ def largest_px(camera: LineCamera, parameters: SelfCalibration, values: np.ndarr
 def blamed(seed: int, setting: str) -> bool:
     """Whether a vibration is taken for the camera."""
     flown = simulate(PLAN, seed, SETTINGS[setting], OBSERVED, world=ROWS["sine-fast"].world)
-    return estimated(flown, navigate(flown), left_by_calibration(PLAN.camera)).window.network.calibration.factor > 1.0
+    window = estimated(flown, navigate(flown), left_by_calibration(PLAN.camera)).window
+    assert window is not None
+    return window.network.calibration.factor > 1.0
 
 
 def estimated(flown: Simulation, poses: Sequence[TimedPose], camera: SelfCalibration | None) -> OnlineResult:

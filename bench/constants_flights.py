@@ -161,6 +161,7 @@ def matching() -> Outcome:
     """One strip of three CCD lines of 800 px, 15 s long."""
     settings = {"sensor": "ads40-small", "pixels": 800, "images": True, "seconds": 15.0, "lead_in": 2.0, "seed": 3}
     made = simulated_flight({**settings, "height": 800.0})
+    assert made.imager is not None
     flight = made.simulation.flight
     lines = flight.strips[0].lines
     images = [made.imager.render(0, ccd, 0, lines) for ccd in range(len(flight.camera.lines))]

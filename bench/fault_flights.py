@@ -76,9 +76,9 @@ class Rig:
         self.fault_ns = 0  # when it came, by the clock of this machine
         self.first_ns = self.newest_ns = 0  # stamps of the replay that were heard
 
-    def start(self, name: str, **named: str) -> None:
+    def start(self, name: str, id: str = "") -> None:
         more = ["-o", str(self.output)] if name == "recorder" else []
-        self.group.start(name, *more, **named)
+        self.group.start(name, *more, id=id)
 
     def bus(self) -> Bus:
         """The session of this program."""
@@ -185,9 +185,9 @@ class RemoteRig(Rig, ABC):
         """Where a program with a port listens."""
         return [f"tcp/127.0.0.1:{port}"]
 
-    def start(self, name: str, **named: str) -> None:
+    def start(self, name: str, id: str = "") -> None:
         more = ["-o", str(self.output)] if name == "recorder" else []
-        self.group.start(name, *more, "--bus", str(self._file(name)), **named)
+        self.group.start(name, *more, "--bus", str(self._file(name)), id=id)
 
     def bus(self) -> Bus:
         return Bus(source="campaign", file=self._file("campaign"))
@@ -315,8 +315,8 @@ class SlowDiskRig(Rig):
         limit = f"{os.major(device)}:{os.minor(device)} {self._bytes_s:.0f}"
         (self.group_folder / "blkio.throttle.write_bps_device").write_text(limit)
 
-    def start(self, name: str, **named: str) -> None:
-        super().start(name, **named)
+    def start(self, name: str, id: str = "") -> None:
+        super().start(name, id)
         if name == "recorder":
             (self.group_folder / "cgroup.procs").write_text(str(self.group.processes[name].process.pid))
 
@@ -363,11 +363,11 @@ class LongRig(Rig):
         self.tenth_s = seconds / 10.0
         self.seen: list[tuple[float, dict[str, tuple[float, int]]]] = []  # s of flight; MB and files of each node
 
-    def start(self, name: str, **named: str) -> None:
+    def start(self, name: str, id: str = "") -> None:
         if name == "adjuster":
-            self.group.start(name, "--set", f"grid_hz={self.grid_hz:g}", **named)
+            self.group.start(name, "--set", f"grid_hz={self.grid_hz:g}", id=id)
         else:
-            super().start(name, **named)
+            super().start(name, id)
 
     def watch(self) -> None:
         threading.Thread(target=self._look, daemon=True).start()

@@ -231,7 +231,7 @@ def kill(given: argparse.Namespace) -> int:
     for killing in (False, True):
         cluster = LocalCluster(
             given.workers, threads_per_worker=1, processes=True, host="127.0.0.1", silence_logs=50,
-            dashboard_address=None,  # pyright: ignore[reportArgumentType]
+            dashboard_address=None,
         )  # fmt: skip
         over, killed = threading.Event(), []
 

@@ -37,7 +37,7 @@ class Listener(Node):
 
     def __init__(self, name: str) -> None:
         super().__init__()
-        self.name = name
+        self.name = name  # pyrefly: ignore[read-only]  # several of one class
 
     def step(self, message: Message) -> tuple[()]:
         return ()

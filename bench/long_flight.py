@@ -98,7 +98,7 @@ def fly(recording: Path, output: Path, pace: str) -> tuple[np.ndarray, np.ndarra
             updates.append((now_s, took, took / reference()))
         return result
 
-    Window.update = timed  # type: ignore[method-assign]  # the program measures from outside
+    Window.update = timed  # the program measures from outside
     collections = RareCollections()
     reader = RecordingReader(recording)
     nodes = [build(registry.node_class(name), at_pace({}, pace)) for name in registry.ESTIMATING]

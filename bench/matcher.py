@@ -31,6 +31,7 @@ from triline.solver.matching.line_store import LineRing
 from triline.solver.matching.looks import verdict
 from triline.solver.matching.options import MatchingOptions
 from triline.solver.matching.search import Ground, Image, find
+from triline.solver.matching.tie_matcher import TieMatcher
 
 
 def rate(points_per_s: float, budget_mb: float) -> dict:
@@ -38,7 +39,8 @@ def rate(points_per_s: float, budget_mb: float) -> dict:
     reader = RecordingReader(RECORDING)
     topics = {c.topic for c in reader.channels.values() if c.topic.startswith(("configuration", "sensor"))}
     navigator = StepDriver(Navigator())
-    matcher = StepDriver(Matcher(points_per_s=points_per_s, budget_mb=budget_mb, delay_s=0.0))
+    node = Matcher(points_per_s=points_per_s, budget_mb=budget_mb, delay_s=0.0)
+    matcher = StepDriver(node)
     cpu, ties, steps = 0.0, [], []
 
     def give(message: Message) -> None:
@@ -68,13 +70,15 @@ def rate(points_per_s: float, budget_mb: float) -> dict:
     seconds = (stamp[-1] - stamp[steady][0]) * 1e-9
     step_s, used = np.array(steps, dtype=float).T
     busy = (step_s >= stamp[0]) & (step_s <= stamp[-1])
-    store = matcher.node._matcher.store
+    assert isinstance(node._matcher, TieMatcher)
+    store = node._matcher.store
+    assert store is not None
     return {
         "points_per_s": points_per_s, "rays_per_s": float(rays[steady].sum() / seconds), "seconds": float(seconds),
         "cores": float(used[busy].sum() / ((stamp[-1] - stamp[0]) * 1e-9)),
         "latency_p50_s": float(np.quantile(latency[steady], 0.5)),
         "latency_p95_s": float(np.quantile(latency[steady], 0.95)),
-        "store_mb": store.nbytes / 1e6, "cover": store.cover, "counters": dict(matcher.node.counters),
+        "store_mb": store.nbytes / 1e6, "cover": store.cover, "counters": dict(node.counters),
     }  # fmt: skip
 
 
@@ -85,6 +89,7 @@ def views(seed: int) -> dict:
     """Nadir and forward view of a flight, with their true geometry."""
     flight = (flown := simulated_flight({"sensor": "ads40-small", "pixels": 1600, "images": True, "seconds": 45.0,
                                          "seed": seed})).simulation.flight  # fmt: skip
+    assert flown.imager is not None
     strip, camera = flight.strips[0], flight.camera
     middle = strip.lines // 2
     scans, rings = [], []

@@ -155,7 +155,7 @@ def strips_of(recording: Path, dem: Path, folder: Path) -> dict[str, float]:
                 rasterio.open(one.with_suffix(".sigma.tif")) as p,
                 rasterio.open(other.with_suffix(".sigma.tif")) as q,
             ):
-                s = [np.array([v[0] for v in image.sample(places)]) for image in (p, q)]
+                s = [np.array([v[0] for v in image.sample(places.tolist())]) for image in (p, q)]
             good = np.isfinite(s[0] + s[1])
             length += np.linalg.norm(offset[good], axis=1).tolist()
             ratio += (np.linalg.norm(offset[good], axis=1) / np.hypot(s[0], s[1])[good]).tolist()

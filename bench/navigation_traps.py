@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import frame
 import numpy as np
@@ -70,9 +71,10 @@ SHIFTS = (1.0, -1.0, 2.0, -2.0, 5.0, 18.0, -18.0, 37.0, -37.0, -19.0)
 
 def flight(kind: str, grade: str, gnss: str, seed: int, duration_s: float):
     rng = np.random.default_rng([seed, 5])
-    plan = {"survey": {}, "straight": {"line_s": 2.0 * duration_s, "turbulence": 0.3},
-            "after rest": {"static_s": 60.0}}[kind]  # fmt: skip
-    motion = survey_flight(duration_s, rng, **plan)
+    plans: dict[str, dict[str, Any]] = {
+        "survey": {}, "straight": {"line_s": 2.0 * duration_s, "turbulence": 0.3}, "after rest": {"static_s": 60.0}
+    }  # fmt: skip
+    motion = survey_flight(duration_s, rng, **plans[kind])
     time_s = 0.5 + np.arange(int((duration_s - 1.0) * 200.0) + 1) / 200.0
     inertial, _ = with_errors(motion.increments(time_s), GRADES[grade], rng)
     fixes = gnss_fixes(motion, np.arange(1.0, duration_s - 0.6) + 0.0037, SIGMAS[gnss], rng, ARM)

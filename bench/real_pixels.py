@@ -83,7 +83,8 @@ class Look:
 
     def ground(self, pixel: Array, height_m: Array) -> Array:
         """Local points (n, 3) of pixels (n, 2) at ellipsoidal heights (n,)."""
-        g = self.rpc.direct(*(pixel + self.first).T, height_m)
+        line, sample = (pixel + self.first).T
+        g = self.rpc.direct(line, sample, height_m)
         return self.local.from_geodetic(np.degrees(g[:, 0]), np.degrees(g[:, 1]), height_m)
 
     def patches(self, ground: Ground, line: Array, half: int, factor: int) -> Patches:
@@ -91,10 +92,10 @@ class Look:
         grid = factor * np.arange(-half, half + 1.0)
         u, v = np.moveaxis(self.place(ground.points(grid, grid)), -1, 0)
         pad = factor + 2
-        first = [np.floor(a.min(axis=(1, 2))).astype(np.int64) - pad for a in (u, v)]
+        row, column = (np.floor(a.min(axis=(1, 2))).astype(np.int64) - pad for a in (u, v))
         size = [int(np.ceil(np.ptp(a, axis=(1, 2)).max())) + 2 * pad + 6 for a in (u, v)]
         n, m = (x // factor * factor + factor for x in size)
-        windows, holes = Windows(*first, *self.ring.windows(*first, n, m)).mended(0.98 * FULL_SCALE)
+        windows, holes = Windows(row, column, *self.ring.windows(row, column, n, m)).mended(0.98 * FULL_SCALE)
         values, known = windows.reduced(factor).sample(u, v, cubic=factor == 1)
         known &= (u >= 0) & (v >= 0) & (u <= self.pixels.shape[0] - 1) & (v <= self.pixels.shape[1] - 1)
         share = known.reshape(len(line), -1).mean(axis=1)
@@ -116,7 +117,8 @@ def looks() -> tuple[Look, Look]:
             pixels, first = file.read(1), np.array([file.transform.f, file.transform.c])
         rpc = read_scene(VENTOUX / f"{side}_image.geom").rpc
         assert rpc is not None
-        middle = np.degrees(rpc.direct(*(first + np.array(pixels.shape) / 2), HEIGHT_M)).ravel()
+        line, sample = first + np.array(pixels.shape) / 2
+        middle = np.degrees(rpc.direct(line, sample, HEIGHT_M)).ravel()
         local = local or LocalFrame(float(middle[0]), float(middle[1]), HEIGHT_M)
         ring = LineRing(pixels.shape[1], pixels.shape[0])
         ring.add(0, pixels)
@@ -148,8 +150,9 @@ def match(apart: int, options: MatchingOptions) -> tuple[Array, Found, NDArray[n
     left, right = looks()
     pixel = places(left.pixels, apart, options)
     srtm, z = HeightRaster([VENTOUX / "N44E005.hgt"], None, GEOID_M), np.full(len(pixel), HEIGHT_M)
+    line, sample = (pixel + left.first).T
     for _ in range(5):
-        g = left.rpc.direct(*(pixel + left.first).T, z)
+        g = left.rpc.direct(line, sample, z)
         z = srtm.at(g[:, 0], g[:, 1])
     there = right.place(left.ground(pixel, z))
     shown = ((there > AROUND_PX) & (there < np.array(right.pixels.shape) - AROUND_PX)).all(axis=1)

@@ -58,7 +58,8 @@ def write_by_library(path: Path, raws: Iterable[RawMessage]) -> None:
         writer.start()
         channel = writer.register_channel("bench", "", 0)
         for raw in raws:
-            writer.add_message(channel, raw.receive_ns, raw.data, raw.envelope.stamp_ns, raw.envelope.sequence)  # type: ignore[arg-type]
+            envelope = raw.envelope
+            writer.add_message(channel, raw.receive_ns, bytes(raw.data), envelope.stamp_ns, envelope.sequence)
         writer.finish()
 
 

@@ -61,7 +61,7 @@ def make_scene(folder: Path, lines: int, samples: int) -> dict[str, str]:
             n = min(512, lines - row)
             grain = rng.integers(0, 300, (n, samples), dtype=np.uint16)
             wave = 800 + 300 * np.sin(np.arange(samples) / 17.0)[None] * np.cos((row + np.arange(n)) / 23.0)[:, None]
-            target.write((grain + wave).astype(np.uint16), 1, window=Window(0, row, samples, n))  # pyright: ignore[reportCallIssue]
+            target.write((grain + wave).astype(np.uint16), 1, window=Window(0, row, samples, n))
     write_rpb(folder / "image.RPB", rpc)  # last: a new image takes what stands beside the old one away
     return {"image": str(folder / "image.tif"), "rpc": str(folder / "image.RPB"), "dem": str(folder / "heights.tif")}
 
@@ -139,7 +139,7 @@ def speed(folder: Path, lines: int, samples: int, workers: int) -> tuple[dict, b
     with rasterio.open(folder / "plain.tif") as one, rasterio.open(folder / "gdal.tif") as two:
         cells = one.width * one.height
         corner = one.width // 2 - 500, one.height // 2 - 500
-        middle = Window(*corner, 1000, 1000)  # pyright: ignore[reportCallIssue]
+        middle = Window(*corner, 1000, 1000)
         a, b = one.read(1, window=middle).astype(float), two.read(1, window=middle).astype(float)
     known = (a > 0) & (b > 0)
     rows = {}

@@ -73,7 +73,7 @@ def main() -> int:
     with RPCTransformer(rasterio_rpc(fit.rpc)) as transformer:
         times = [
             seconds(lambda: transformer.xy(u, v, h)),
-            seconds(lambda: transformer.rowcol(lon, lat, h, op=lambda x: x)),
+            seconds(lambda: transformer.rowcol(lon, lat, h, op=lambda x: x)),  # pyrefly: ignore[no-matching-overload]  # arrays
         ]
     print(f"{'rasterio RPCTransformer':36s} {times[0]:8.2f} {times[1]:8.2f}")
     earth = EarthOrientation(installed_table(), parse_time("2018-12-26T10:48:55Z"))

@@ -55,6 +55,7 @@ def adjust_batch(simulation: Simulation, poses: list[TimedPose], stated: SelfCal
 def of_batch(simulation: Simulation, found: BatchResult, times: np.ndarray) -> tuple[Errors, Errors, list[str]]:
     """Errors of orientation at times, of tie points, and the names of these."""
     solution, strip = found.solution, found.network.strips[0]
+    assert strip.noise is not None
     off = batch_errors(simulation, found, strip.id, times)
     noise = noise_between(strip.trajectory.time_s, strip.noise, times)
     left_out = solution.layout.sets[0].model.left_out_variance(times)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from bisect import bisect_right
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from triline.nodes.recording.reader import RecordingReader
 from triline.schemas import codec
 
 
-def computed(path: Path, topics: list[str], settings: dict[str, object], full_s: float, until_s: float) -> dict:
+def computed(path: Path, topics: list[str], settings: dict[str, Any], full_s: float, until_s: float) -> dict:
     """Latency of tie points and processor time of updates, of the time from which on the window is full.
 
     Parameters

@@ -62,7 +62,7 @@ class Stopwatch:
             self.updates.append(self._of_update)
             return update(window, now_s)
 
-        Window.update = counted
+        Window.update = counted  # pyrefly: ignore[bad-assignment]  # nobody names its first argument
 
     def _timed(self, title: str, work: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(work)

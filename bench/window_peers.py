@@ -24,6 +24,7 @@ import numpy as np
 
 from triline.nodes.garbage_collection import RareCollections
 from triline.solver.camera.self_calibration import tls
+from triline.solver.models.wander import Wander
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate
@@ -81,6 +82,7 @@ def gtsam_ms(recorded: Recorded, window: Window, cameras: int, first: float) -> 
     strip = recorded.strip
     assert strip is not None
     base = int(strip.numbers[0])
+    assert isinstance(strip.model, Wander)
     borders = strip.model.borders
 
     def key_of(number: int) -> tuple[int, int]:
@@ -140,6 +142,7 @@ def gtsam_ms(recorded: Recorded, window: Window, cameras: int, first: float) -> 
             started = True
             if cameras:
                 enter(gtsam.symbol("c", 0), now_s)
+                assert window.network.self_calibration is not None
                 sigma = window.network.self_calibration.apriori_sigma
                 graph.add(factor({gtsam.symbol("c", 0): np.diag(1.0 / sigma)}, np.zeros(cameras)))
         until = int(np.searchsorted(borders, now_s + 3.0, side="right"))
