@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +16,12 @@ from ...solver.adjustment.refined_orientation import AT_ONCE, correction_cofacto
 from ...solver.adjustment.reliability import reliability
 from ...solver.geometry.rotation import corrected_angles, matrix_from_angles
 from ..formats.line_orientation import OrientedLines, poses_in_crs
-from ..formats.new_file import new_file
+from ..formats.table import write_table
 from .adjustment_result import TABLES, Adjustment, set_name
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-
 Array = NDArray[np.floating]
+#: By name of the column: numbers, or words as objects.
+Columns = dict[str, NDArray[Any]]
 
 _AXES = ("X", "Y", "Z")
 _ANGLES = ("omega", "phi", "kappa")
@@ -33,20 +31,17 @@ def write_tables(adjustment: Adjustment, folder: Path) -> list[Path]:
     """Write ``points.csv``, ``residuals.csv`` and ``trajectory_refined.csv``; returns their paths."""
     paths = []
     for name, table in zip(TABLES, (points_table, residuals_table, trajectory_table), strict=True):
-        path = folder / name
-        with new_file(path) as part:
-            table(adjustment).to_csv(part, index=False)
+        path, columns = folder / name, table(adjustment)
+        write_table(path, columns, {key: "" for key, values in columns.items() if values.dtype != object})
         paths.append(path)
     return paths
 
 
-def points_table(adjustment: Adjustment) -> pd.DataFrame:
+def points_table(adjustment: Adjustment) -> Columns:
     """Adjusted object points in the project's CRS, in the order of the input; empty where nothing is determined.
 
     Columns of coordinates state the unit of the CRS (``X_m`` or ``X_deg``); sigmas are in metres.
     """
-    import pandas as pd
-
     block, result = adjustment.block, adjustment.result
     network = result.network
     order = np.array([network.point_index[id] for id in block.point_ids if id in network.point_index], dtype=np.int64)
@@ -61,18 +56,16 @@ def points_table(adjustment: Adjustment) -> pd.DataFrame:
         sigma[known] = np.sqrt(np.maximum(np.einsum("pji,pjk,pki->pi", R, C[known], R), 0.0))
     in_use = np.bincount(network.rays.point, result.solution.ray_weight > 0, network.n_points).astype(int)
     decimals = 9 if frame.is_geographic else 5
-    columns: dict[str, object] = {"point": [network.point_ids[i] for i in order]}
+    columns: Columns = {"point": _words(network.point_ids[i] for i in order)}
     columns |= {a: np.round(places[:, k], 5 if k == 2 else decimals) for k, a in enumerate(place_columns(frame.units))}
     columns |= {f"sigma_{a}_m": np.round(sigma[:, k], 6) for k, a in enumerate(_AXES)}
     doubtful = np.isin(order, [d.point for d in result.doubtful]).astype(int)
     role = network.role()
-    return pd.DataFrame(columns | {"rays": in_use[order], "role": role[order], "doubtful": doubtful})
+    return columns | {"rays": in_use[order], "role": _words(role[order]), "doubtful": doubtful}
 
 
-def residuals_table(adjustment: Adjustment) -> pd.DataFrame:
+def residuals_table(adjustment: Adjustment) -> Columns:
     """Residuals of all image points that could be used, in the order of the input, pixels."""
-    import pandas as pd
-
     block, result = adjustment.block, adjustment.result
     rays, s = result.network.rays, result.rays
     order = np.argsort(rays.source)
@@ -80,10 +73,10 @@ def residuals_table(adjustment: Adjustment) -> pd.DataFrame:
     r = reliability(s.redundancy, s.sigma_px)
     out = np.zeros(len(rays), dtype=bool)
     out[[x.ray for x in result.rejected if x.ray >= 0]] = True
-    columns: dict[str, object] = {
-        "point": [n[0] for n in names],
-        "strip": [n[1] for n in names],
-        "ccd": [n[2] for n in names],
+    columns: Columns = {
+        "point": _words(n[0] for n in names),
+        "strip": _words(n[1] for n in names),
+        "ccd": _words(n[2] for n in names),
         "line": rays.line[order],
         "sample": rays.sample[order],
     }
@@ -98,13 +91,11 @@ def residuals_table(adjustment: Adjustment) -> pd.DataFrame:
         unit = "_px" if prefix in ("v", "detectable") else ""
         for k, coordinate in enumerate(("line", "sample")):
             columns[f"{prefix}_{coordinate}{unit}"] = np.round(values[order, k], digits)
-    return pd.DataFrame(columns | {"rejected": out[order].astype(int)})
+    return columns | {"rejected": out[order].astype(int)}
 
 
-def trajectory_table(adjustment: Adjustment) -> pd.DataFrame:
+def trajectory_table(adjustment: Adjustment) -> Columns:
     """Refined orientation at the samples of the measured trajectories, in the project's CRS, with sigmas."""
-    import pandas as pd
-
     frame, reference = adjustment.block.frame, adjustment.block.time_reference_ns
     parts = []
     for item in adjustment.result.solution.layout.sets:
@@ -112,23 +103,28 @@ def trajectory_table(adjustment: Adjustment) -> pd.DataFrame:
         places, angles, sigma = poses_in_crs(*_refined(adjustment, item, time), frame)
         angles = np.degrees(angles)
         decimals = 9 if frame.is_geographic else 5
-        columns: dict[str, object] = {"strip": set_name(adjustment, item), "time_s": _seconds(time, reference)}
+        strip = _words([set_name(adjustment, item)] * len(time))
+        columns: Columns = {"strip": strip, "time_s": _seconds(time, reference)}
         columns |= {
             a: np.round(places[:, k], 5 if k == 2 else decimals) for k, a in enumerate(place_columns(frame.units))
         }
         columns |= {f"{a}_deg": np.round(angles[:, k], 9) for k, a in enumerate(_ANGLES)}
         columns |= {f"sigma_{a}_m": np.round(sigma[:, k], 6) for k, a in enumerate(_AXES)}
         columns |= {f"sigma_{a}_deg": np.round(np.degrees(sigma[:, 3 + k]), 9) for k, a in enumerate(_ANGLES)}
-        parts.append(pd.DataFrame(columns))
-    return pd.concat(parts, ignore_index=True)
+        parts.append(columns)
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _seconds(time_s: Array, reference_ns: int) -> Array | list[str]:
+def _words(words: Iterable[str]) -> NDArray[np.object_]:
+    return np.array(list(words), dtype=object)
+
+
+def _seconds(time_s: Array, reference_ns: int) -> NDArray[Any]:
     """Seconds as they stand in tables: of a recording UTC since 1970, with all digits."""
     if not reference_ns:
         return np.round(time_s, 9)
     whole = [divmod(reference_ns + round(float(t) * 1e9), 10**9) for t in time_s]
-    return [f"{seconds}.{rest:09d}" for seconds, rest in whole]
+    return _words(f"{seconds}.{rest:09d}" for seconds, rest in whole)
 
 
 def _refined(adjustment: Adjustment, item: CorrectionSet, time_s: Array) -> tuple[Array, Array, Array]:

@@ -220,14 +220,19 @@ def write_table(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]],
 
     The file gets its name when it is whole.
     """
-    cells = []
-    for name, values in columns.items():
-        spec = formats.get(name)
-        cells.append([str(v) if spec is None else "" if v != v else format(v, spec) for v in values])
+    cells = [_cells(values, formats.get(name)) for name, values in columns.items()]
     with new_file(path) as part, open(part, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows(zip(*cells, strict=True))
+
+
+def _cells(values: Sequence[Any] | NDArray[Any], spec: str | None) -> list[Any]:
+    if spec is None:
+        return [str(v) for v in values]
+    if spec == "" and isinstance(values, np.ndarray) and values.dtype in (np.float64, np.int64):
+        return ["" if v != v else v for v in values.tolist()]  # `csv` writes all digits, in half the time
+    return ["" if v != v else format(v, spec) for v in values]
 
 
 def csv_field(text: str) -> str:
