@@ -78,6 +78,21 @@ class RecordingFile:
     def tell(self) -> int:
         return self._size
 
+    def fate(self) -> str:
+        """What somebody has done with the file: ``""`` where it is under its name, ``deleted`` or ``moved away``.
+
+        Raises
+        ------
+        OSError : the disk does not say
+        """
+        written = os.fstat(self._descriptor)
+        try:
+            if os.path.samestat(os.stat(self.path), written):
+                return ""
+        except (FileNotFoundError, NotADirectoryError):
+            pass
+        return "moved away" if written.st_nlink else "deleted"
+
     def flush(self) -> None:
         """Every write goes to the operating system at once."""
 
@@ -133,7 +148,7 @@ class Recorder(Node):
         self._writer: RecordingWriter | None = None
         self._flushed_s = 0.0
         self._retry_s = 0.0
-        self._unflushed = 0
+        self._unflushed = self._in_file = 0
         self._lost = 0
         self._measured_s = 0.0  # when the disk was looked at, and what had been written by then
         self._written = self._bytes_before = 0
@@ -215,6 +230,8 @@ class Recorder(Node):
     def tend(self, waited_s: float = 0.0, waiting: int = 0) -> None:
         """Close the open chunk when it is time, change files when one is large enough, try a full disk again.
 
+        A file that was deleted or moved away meanwhile is told, and another one begun, in a new folder if need be.
+
         Something has waited to be written for ``waited_s``, and as many bytes wait now.
         """
         now = time.monotonic()
@@ -233,6 +250,9 @@ class Recorder(Node):
         elif now - self._flushed_s >= FLUSH_S:
             self._flushed_s = now
             try:
+                if why := self._gone():
+                    self._try_again(now, why)
+                    return
                 self._writer.flush()
                 if self._file is not None:
                     self._file.sign()
@@ -247,6 +267,7 @@ class Recorder(Node):
     def close(self) -> None:
         """Write the index and close the file."""
         try:
+            self._gone()
             self._close()
         except OSError as error:
             self._fail(error)
@@ -275,8 +296,24 @@ class Recorder(Node):
             raise
         self.files.append(path)
         self._flushed_s = time.monotonic()
-        self._unflushed = 0
+        self._unflushed = self._in_file = 0
         self._closed_to = self._file.tell()
+
+    def _gone(self) -> str:
+        """Let go of a file that is not under its name any more, and say what has become of it; "" if it is there."""
+        if self._file is None or self._writer is None or not (fate := self._file.fate()):
+            return ""
+        path, in_file = self._file.path, self._in_file
+        self._bytes_before += self._writer.size
+        self._writer.flush()
+        self._note_closed()
+        self._writer.close()
+        self._file.close()
+        self._writer = self._file = None
+        if fate == "deleted":
+            self._lose(in_file)
+        self.problem("disk", f"{path}: was {fate} while it was written")
+        return f"{self.last_problem}; "
 
     def _note_closed(self) -> None:
         """What was written since the last time can be found again."""
@@ -307,6 +344,7 @@ class Recorder(Node):
             self._lose(1)
             return
         self._unflushed += 1
+        self._in_file += 1
         try:
             self._writer.write_raw(raw)
             self._reread.note(raw)
@@ -350,14 +388,15 @@ class Recorder(Node):
         self._retry_s = time.monotonic() + RETRY_S
         self.problem("disk", f"{path}: {(error.strerror or str(error)).lower()}")
 
-    def _try_again(self, now: float) -> None:
+    def _try_again(self, now: float, why: str = "") -> None:
         self._retry_s = now + RETRY_S
         try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
             self._open()
         except OSError as error:
-            self.last_problem = f"{self._path}: {(error.strerror or str(error)).lower()}"
+            self.last_problem = f"{why}{self._path}: {(error.strerror or str(error)).lower()}"
         else:
-            self.problem("resumed", f"recording again, into {self.files[-1]}; {self._lost} messages lost")
+            self.problem("resumed", f"{why}recording again, into {self.files[-1]}; {self._lost} messages lost")
 
 
 class _Backlog:
@@ -426,7 +465,7 @@ def run(options: ProgramOptions) -> int:
     counts = recorder.statistics
     total = sum(c.received for c in counts.values())
     lost = f", {recorder.counters['lost']} lost" if recorder.counters["lost"] else ""
-    names = ", ".join(str(path) for path in recorder.files)
+    names = ", ".join(str(path) for path in recorder.files if path.exists()) or "no file"
     options.report(f"{total} messages in {names}; {recorder.missing} missing by number{lost}")
     return 1 if recorder.counters["disk"] else 0
 

@@ -207,6 +207,54 @@ def test_a_full_disk_is_reported_the_recorder_lives_and_resumes(disk, tmp_path):
     assert [str(d) for d in first.damage] == []
 
 
+def configuration_and(raws):
+    body = codec.encode(sample.body("configuration/strip"))
+    return [RawMessage("configuration/strip", Envelope(0, "test", 0), body), *raws]
+
+
+@pytest.mark.parametrize("fate", ["deleted", "moved away"])
+def test_a_recording_whose_folder_goes_away_is_told_and_goes_on_in_another(fate, tmp_path, monkeypatch):
+    """Its name promised a recording that nobody could find any more."""
+    monkeypatch.setattr(module, "FLUSH_S", 0.0)
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    recorder = Recorder(str(folder / "a.mcap"))
+    recorder.start()
+    recorder.take(configuration_and(raws(20)))
+    recorder.tend()
+    folder.rename(tmp_path / "elsewhere")
+    if fate == "deleted":
+        (tmp_path / "elsewhere" / "a.mcap").unlink()
+    recorder.tend()
+    lost = 21 if fate == "deleted" else 0
+    again = recorder.files[-1]
+    assert recorder.last_problem == (
+        f"{folder / 'a.mcap'}: was {fate} while it was written; recording again, into {again}; {lost} messages lost"
+    )
+    assert recorder.counters["disk"] == 1 and recorder.counters["lost"] == lost
+    recorder.take(raws(20, 20))
+    recorder.tend()
+    recorder.close()
+    assert again.exists()
+    reader = RecordingReader(again)
+    assert findings(reader) == []
+    assert reader.raw(0).topic == "configuration/strip"
+    assert reader.index.sequence[reader.select(["sensor/attitude"])].tolist() == list(range(20, 40))
+    if fate == "moved away":
+        moved = RecordingReader(tmp_path / "elsewhere" / "a.mcap")
+        assert findings(moved) == [] and len(moved.select(["sensor/attitude"])) == 20
+
+
+def test_a_recording_that_is_deleted_at_last_is_told(tmp_path):
+    recorder = Recorder(str(tmp_path / "a.mcap"))
+    recorder.start()
+    recorder.take(raws(20))
+    (tmp_path / "a.mcap").unlink()
+    recorder.close()
+    assert recorder.counters["disk"] == 1 and recorder.counters["lost"] == 20
+    assert recorder.last_problem == f"{tmp_path / 'a.mcap'}: was deleted while it was written"
+
+
 def test_a_recorder_that_is_slower_than_publishers_makes_them_wait_and_loses_nothing(tmp_path, monkeypatch):
     """What it says of itself comes back to it over the bus while more waits for the disk than may."""
     monkeypatch.setattr(module, "WAITING_BYTES", 2000)
