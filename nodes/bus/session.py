@@ -188,7 +188,8 @@ class Bus:
         try:
             self._session = zenoh.open(configuration(self._port, file))
         except zenoh.ZError as error:
-            raise UserError(f"cannot open the bus: {self._why_closed() or _one_line(error)}") from None
+            where = f"{file}: " if file is not None else ""
+            raise UserError(f"{where}cannot open the bus: {self._why_closed() or _one_line(error)}") from None
         self._publishers: dict[str, Any] = {}
         self._recipes: list[Recipe] = []  # how all that is declared is declared again
         self._declared: list[Any] = []

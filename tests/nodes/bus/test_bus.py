@@ -367,6 +367,9 @@ def test_a_zenoh_configuration_file_is_accepted(tmp_path):
     for file, text in ((bad, "not a Zenoh configuration"), (tmp_path / "none", "no such Zenoh configuration file")):
         with pytest.raises(UserError, match=text):
             Bus(file=file)
+    bad.write_text('{mode: "peer", listen: {endpoints: ["tcp/127.0.0.1:99999"]}}')
+    with pytest.raises(UserError, match=r"bad\.json5: cannot open the bus: invalid port value$"):
+        Bus(file=bad)
 
 
 def test_a_platform_hears_only_itself():
