@@ -285,10 +285,11 @@ class BusRunner:
         self._hear(message.topic)
         if message.topic == "configuration/strip":
             self._open_strip = "" if message.body.ended else message.body.id
-        failed, begun = self.node.counters["failed"], time.monotonic()
+        failed, refused = self.node.counters["failed"], self.node.counters["malformed"]
+        begun = time.monotonic()
         with self._lock:  # queries are answered between steps
             outputs = self._driver.step(message)
-        if self.node.counters["failed"] > failed:
+        if self.node.counters["failed"] > failed or self.node.counters["malformed"] > refused == 0:
             self._report(f"{self.node.name}: {self.node.last_problem}")
         for output in outputs:
             self._publish(output)

@@ -10,6 +10,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ...schemas import codec
 from ...schemas.envelope import RawMessage
 from ..bus.processes import NodeGroup
@@ -224,6 +226,7 @@ class Fly(LiveFlight):
         self._tell_problems()
         if self._configured:
             self._tell_clocks()
+            self._tell_far()
             return
         origin = self.flight.origin_deg or self.first.place
         if not self.first.newest_ns or origin is None:
@@ -250,15 +253,32 @@ class Fly(LiveFlight):
                 end()
             self._endings = []
 
-    def _tell_problems(self) -> None:
-        """Show what sensor programs refuse or lack, when it comes first."""
+    def _tell_far(self) -> None:
+        """Show an origin of the local frame at which this flight cannot be, once the first fix has come."""
         assert self.watch is not None
-        for id in self.programs:
+        origin, place = self.flight.origin_deg, self.first.place
+        if origin is None or place is None or ("origin", "far") in self._told:
+            return
+        from ..formats.flight_folder import FAR_M, distance_m
+
+        self._told.add(("origin", "far"))
+        away = distance_m(np.array([origin]), np.array([place]))
+        if away > FAR_M:
+            what = "control" if self.flight.control is not None else "flight.origin_deg"
+            self.watch.tell(
+                f"the origin lies {1e-3 * away:.0f} km from the first GNSS fix ({place[0]:.4f}, {place[1]:.4f} deg), "
+                f"wanted at most {1e-3 * FAR_M:.0f} km: see {what}, and flight.crs ({self.flight.crs})"
+            )
+
+    def _tell_problems(self) -> None:
+        """Show what sensor programs refuse or lack, and what nodes refuse, when it comes first."""
+        assert self.watch is not None
+        for id in (*self.programs, *self.estimators):
             status = self._overview.nodes.get(id)
             if status is None:
                 continue
             for counter in status.counters:
-                if (id, counter.name) not in self._told:
+                if (id in self.programs or counter.name == "malformed") and (id, counter.name) not in self._told:
                     self._told.add((id, counter.name))
                     self.watch.tell(f"{id}: {counter.name}: {status.last_problem}")
 

@@ -322,6 +322,9 @@ class LiveFlight:
                 for kind in kinds:
                     if getattr(topic, kind) and not topic.topic.startswith("status/"):
                         sums[f"{name}: {topic.topic} {kind}"] = getattr(topic, kind)
+            refused = sum(c.value for c in status.counters if c.name == "malformed" and name in self.estimators)
+            if "malformed" in kinds and refused:  # what it could read, and could not use, among them
+                sums[f"{name}: malformed"] = refused
         return sums
 
     def summary(self, result: dict[str, Any]) -> str:

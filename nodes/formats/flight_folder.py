@@ -674,7 +674,7 @@ def _control(flight: Flight, keys: Keys, general: Keys) -> None:
             f"{path.name}: median height {flight.ground_height_m:g} m above the ellipsoid is the origin's"
         )
     if flight.places_deg is not None and len(points.xyz_l):
-        away = _distance_m(frame.to_geodetic(points.xyz_l)[:, :2], flight.places_deg)
+        away = distance_m(frame.to_geodetic(points.xyz_l)[:, :2], flight.places_deg)
         if away > FAR_M:
             raise UserError(
                 f"{path.name}: no point lies within {1e-3 * away:.0f} km of the flight, "
@@ -685,7 +685,7 @@ def _control(flight: Flight, keys: Keys, general: Keys) -> None:
         flight.origin_deg = frame.lat_deg, frame.lon_deg
 
 
-def _distance_m(one_deg: Array, other_deg: Array) -> float:
+def distance_m(one_deg: Array, other_deg: Array) -> float:
     """Least distance between places (n, 2) and (m, 2) of latitude and longitude in degrees, m; a chord."""
     a, b = (ecef_from_geodetic(lat, lon, 0.0) for lat, lon in (np.radians(one_deg).T, np.radians(other_deg).T))
     return float(np.sqrt(((a[:, None] - b[None]) ** 2).sum(axis=2).min()))

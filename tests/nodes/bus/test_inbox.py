@@ -80,3 +80,22 @@ def test_a_node_that_only_looks_on_slows_nobody():
     assert counts.dropped > 500
     assert counts.dropped + len(runner.node.seen) == 1000
     assert counts.gaps == 0
+
+
+class Refuses(Slow):
+    """Can use nothing that comes."""
+
+    def step(self, message: Message):
+        self.seen.append(message)
+        self.problem("malformed", f"{message.topic}: no. {len(self.seen)} by design")
+        return ()
+
+
+def test_what_a_node_refuses_first_is_written_to_its_log():
+    """All image lines of a camera were refused, and the log said so at the end of the flight."""
+    said: list[str] = []
+    with Bus(port=free_port(), source="slow") as bus:
+        runner = BusRunner(Refuses(), bus, said.append)
+        for number in range(3):
+            runner._work(sample.message("sensor/attitude", number))
+    assert said == ["slow: sensor/attitude: no. 1 by design"]

@@ -190,6 +190,55 @@ def test_nodes_of_others_on_the_port_and_those_that_end_hinder_no_flight(folder,
         assert flight.port() == port
 
 
+class Told:
+    """What would stand on the screen of a flight."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.phase = ""
+
+    def tell(self, text: str) -> None:
+        self.lines.append(text)
+
+
+def flown(folder, nodes=(), place=None):
+    """A flight that has said what it consists of; what nodes have told of themselves, and where its first fix is."""
+    args = parse(["fly", str(folder), "-o", str(folder / "out"), "--no-viewer"])
+    flight = fly.Fly(args, read_flight(folder, live=True), [])
+    flight.watch, flight._configured = Told(), True
+    flight._overview = SimpleNamespace(nodes={status.node: status for status in nodes})
+    flight.first.place = place
+    flight.tend(None)
+    flight.tend(None)
+    return flight
+
+
+def test_image_lines_that_no_node_can_use_are_told_in_flight_and_at_its_end(folder):
+    """A camera.json of 200 px for lines of 180: all of them were refused, and a flight ended without a word of it."""
+    why = "sensor/lines/N: lines of N of shape (10, 180), wanted 200 samples"
+    status = m.NodeStatus(node="matcher", last_problem=why)
+    status.counters.add(name="cells without texture", value=3)
+    status.counters.add(name="malformed", value=130)
+    flight = flown(folder, [status])
+    assert flight.watch.lines == [f"matcher: malformed: {why}"]
+    lost = flight._lost_so_far(("gaps", "malformed", "dropped"))
+    assert lost == {"matcher: malformed": 130}
+    assert flight._lost_so_far(("late",)) == {}
+
+
+@pytest.mark.parametrize(("place", "told"), [((38.2, 53.6), True), ((47.91, 11.2), False), (None, False)])
+def test_an_origin_far_from_the_flight_is_told_with_the_first_fix(folder, place, told):
+    """Control in another CRS put the local frame in another country, and the flight began there without a word."""
+    (folder / "flight.toml").write_text(TOML.replace("[flight]", "[flight]\norigin_deg = [47.9, 11.1]"))
+    said = flown(folder, place=place).watch.lines
+    assert len(said) == told
+    if told:
+        assert said[0] == (
+            "the origin lies 3529 km from the first GNSS fix (38.2000, 53.6000 deg), wanted at most 50 km: "
+            "see flight.origin_deg, and flight.crs (EPSG:32632)"
+        )
+
+
 def connected(port: int) -> socket.socket:
     """A link to a program that is on the bus already and may not listen yet."""
     found: list[socket.socket] = []
