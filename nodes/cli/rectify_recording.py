@@ -12,6 +12,7 @@ import numpy as np
 from ...solver.camera.line_camera import LineCamera
 from ...solver.geometry.ellipsoid import WGS84
 from ...solver.geometry.frames import LocalFrame
+from ...solver.matching.round_earth import RADIUS_M
 from ...solver.orthoimage.error_band import GroundErrors
 from ...solver.orthoimage.ground_grid import GroundGrid, metres_a_unit, utm_of
 from ...solver.orthoimage.orientation import LineOrientation
@@ -26,6 +27,7 @@ from ..batch.rectification import (
     frame_for,
     ground_of_points,
     known_points,
+    line_blocks,
     orientation_of,
     pixel_on_ground,
     project_frame,
@@ -158,7 +160,34 @@ def _ccd(recording: Recording, camera: LineCamera, wanted: str | None) -> int:
         if wanted not in imaged:
             raise UserError(f"{path}: no image lines of CCD line {wanted!r}, there are: {', '.join(imaged)}")
         return camera.line_index[wanted]
+    if len(camera.lenses) > 1:  # each looks by itself: poses say where
+        try:
+            return camera.line_index[min(imaged, key=_tilts(recording, camera, imaged).__getitem__)]
+        except UserError:  # no poses: orientation of a table, or none, which is told later
+            pass
     return min((camera.line_index[id] for id in imaged), key=lambda k: abs(float(camera.ahead_mm[k])))
+
+
+def _tilts(recording: Recording, camera: LineCamera, imaged: list[str]) -> dict[str, float]:
+    """Angle (rad) between the way down and where each CCD line looks, at the first image line that has a pose."""
+    name, orientation, reference_ns = orientation_of(recording, None)
+    of_strip = OfStrips(recording, name, orientation, reference_ns)
+    tilts = {}
+    for id in imaged:
+        ccd = camera.line_index[id]
+        middle = camera.lines[ccd].centre_mm - camera.principal_point_mm[ccd]
+        tilts[id] = np.inf
+        for block in line_blocks(recording, id, None):
+            own = of_strip(block.strip)
+            time_s = (block.times_ns() - reference_ns) * 1e-9
+            if (posed := own.covers(time_s)).any():
+                position, R = own.at(time_s[posed][:1])
+                ray = R[0] @ [*middle, -camera.focal_length_mm[ccd]]
+                down = -position[0] - [0.0, 0.0, RADIUS_M]
+                cosine = ray @ down / (np.linalg.norm(ray) * np.linalg.norm(down))
+                tilts[id] = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+                break
+    return tilts
 
 
 def check_strips(recording: Recording, wanted: list[str] | None) -> None:

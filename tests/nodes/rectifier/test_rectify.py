@@ -1080,3 +1080,12 @@ def test_a_table_of_two_strips_gives_each_its_own_rows(tmp_path):
     )
     with pytest.raises(UserError, match=r"poses\.csv:22: time_s: .* comes twice with two poses"):
         work.OfTable(recording, table, lens="L2")
+
+
+def test_of_several_lenses_the_one_that_looks_down_is_rectified(tmp_path, capsys):
+    """The first of them was, which looks forward: all lines lie in the middle of the image of their own lens."""
+    flight, words = tmp_path / "triplet.mcap", ["--gsd", "1000", "-o", str(tmp_path / "ortho.tif")]
+    simulated = ["simulate", "-o", str(flight), "--satellite", "alos-prism-small", "--images", "--points", "34", "-q"]
+    assert main(simulated) == 0
+    assert main(["rectify", str(flight), *words]) == 0
+    assert " lines of N, measured orientation" in capsys.readouterr().out
