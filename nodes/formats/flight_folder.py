@@ -20,7 +20,7 @@ from ...solver.arrays import Array
 from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.sensors import PRESETS, preset
 from ...solver.geometry.earth import ecef_from_geodetic
-from ...solver.geometry.frames import CrsError, LocalFrame, known_crs
+from ...solver.geometry.frames import CrsError, LocalFrame, known_crs, outside_area
 from ...solver.models import WANDER_SIGMAS, WANDER_TIMES
 from ...solver.navigation.inertial_data import MEMS, TACTICAL, InertialGrade
 from .. import config, registry
@@ -47,6 +47,9 @@ from .track import Accuracy, Mounting, NavigationTrack
 FILE = "flight.toml"
 #: Control whose nearest point is farther from the flight, m, is in another CRS or of another flight.
 FAR_M = 50e3
+#: Control that lies farther outside of the area of its CRS, degrees, is likely to be in another one: maps are used in
+#: neighbouring zones, too.
+OUTSIDE_DEG = 5.0
 #: A CRS of more characters is told by its name.
 LONGEST_CRS = 60
 #: Images of a strip that are named where they are missing.
@@ -673,16 +676,33 @@ def _control(flight: Flight, keys: Keys, general: Keys) -> None:
         flight.notes.append(
             f"{path.name}: median height {flight.ground_height_m:g} m above the ellipsoid is the origin's"
         )
-    if flight.places_deg is not None and len(points.xyz_l):
-        away = distance_m(frame.to_geodetic(points.xyz_l)[:, :2], flight.places_deg)
-        if away > FAR_M:
-            raise UserError(
-                f"{path.name}: no point lies within {1e-3 * away:.0f} km of the flight, "
-                f"wanted coordinates in flight.crs ({flight.crs})"
-            )
+    if len(points.xyz_l):
+        _refuse_far(flight, path.name, frame.to_geodetic(points.xyz_l)[:, :2])
     flight.control = path
     if flight.origin_deg is None:
         flight.origin_deg = frame.lat_deg, frame.lon_deg
+
+
+def _refuse_far(flight: Flight, name: str, control_deg: Array) -> None:
+    """Raise UserError for control (n, 2) that is far from the flight; where nobody says where that is, ask its CRS."""
+    what, places = "the flight", flight.places_deg
+    if places is None and flight.origin_deg is not None:
+        what, places = "flight.origin_deg", np.array([flight.origin_deg])
+    if places is not None:
+        away = distance_m(control_deg, places)
+        if away > FAR_M:
+            raise UserError(
+                f"{name}: no point lies within {1e-3 * away:.0f} km of {what}, "
+                f"wanted coordinates in flight.crs ({flight.crs})"
+            )
+        return
+    lat, lon = np.median(control_deg, axis=0)
+    outside, area = outside_area(flight.crs, lat, lon)
+    if outside > OUTSIDE_DEG:
+        flight.notes.append(
+            f"{name}: lies at about {lat:.1f}, {lon:.1f} deg, {outside:.0f} deg outside of the area of flight.crs "
+            f"({flight.crs}: {area.rstrip('.')}): are its coordinates in that CRS?"
+        )
 
 
 def distance_m(one_deg: Array, other_deg: Array) -> float:

@@ -272,6 +272,24 @@ def known_crs(crs: str, *, geocentric: bool = True):
     raise CrsError(f"crs {crs!r}: {kind} system, wanted a projected or geographic one (with heights)")
 
 
+def outside_area(crs: str, lat_deg: float, lon_deg: float) -> tuple[float, str]:
+    """How far, in degrees, a place lies outside of the area that a CRS is made for, and the name of that area.
+
+    0 inside it, and where nobody states an area.
+
+    Raises
+    ------
+    CrsError : PROJ does not know the CRS
+    """
+    area = known_crs(crs).area_of_use
+    if area is None:
+        return 0.0, ""
+    width = (area.east - area.west) % 360.0 or 360.0
+    east = (lon_deg - area.west) % 360.0
+    beside = 0.0 if east <= width else min(east - width, 360.0 - east)
+    return max(beside, lat_deg - area.north, area.south - lat_deg, 0.0), area.name
+
+
 def _refuse_left_handed(known, crs: str) -> None:
     """Raise CrsError where an image has no omega, phi, kappa in the axes of a CRS."""
     axes, height = tuple(axis.direction.lower() for axis in known.axis_info[:2]), known.axis_info[2:]

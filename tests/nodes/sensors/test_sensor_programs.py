@@ -239,6 +239,27 @@ def test_an_origin_far_from_the_flight_is_told_with_the_first_fix(folder, place,
         )
 
 
+@pytest.mark.parametrize(
+    ("stated", "place", "noted", "refused"),
+    [
+        ("", (4_432_100.0, 5_306_200.0), "control.csv: lies at about ", None),  # Gauss-Krueger, zone 4
+        ("", (890_000.0, 5_306_200.0), None, None),  # the next zone as well
+        ("origin_deg = [47.9, 11.1]", (357_900.0, 5_307_200.0), None, "of flight.origin_deg, wanted coordinates in"),
+        ("origin_deg = [47.9, 11.1]", (656_900.0, 5_307_200.0), None, None),
+    ],
+)
+def test_control_that_is_not_where_its_crs_is_used_is_told(folder, stated, place, noted, refused):
+    """A live flight was called complete, and began in another country."""
+    control = "point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m,role\nP1,{},{},600,0.05,0.05,0.1,control\n"
+    (folder / "control.csv").write_text(control.format(*place))
+    toml = TOML.replace("[flight]", f"[flight]\n{stated}")
+    (folder / "flight.toml").write_text(f'{toml}[control]\nfile = "control.csv"\n')
+    flight = read_flight(folder, live=True)
+    told = [note for note in flight.notes if "outside of the area of flight.crs (EPSG:32632: " in note]
+    assert [note.startswith(noted) for note in told] == [True] * (noted is not None)
+    assert [refused in problem for problem in flight.problems] == [True] * (refused is not None)
+
+
 def connected(port: int) -> socket.socket:
     """A link to a program that is on the bus already and may not listen yet."""
     found: list[socket.socket] = []
