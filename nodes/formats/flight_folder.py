@@ -701,7 +701,7 @@ def _refuse_far(flight: Flight, name: str, control_deg: Array) -> None:
     if outside > OUTSIDE_DEG:
         flight.notes.append(
             f"{name}: lies at about {lat:.1f}, {lon:.1f} deg, {outside:.0f} deg outside of the area of flight.crs "
-            f"({flight.crs}: {area.rstrip('.')}): are its coordinates in that CRS?"
+            f"({flight.crs}: {area}): are its coordinates in that CRS?"
         )
 
 

@@ -273,7 +273,7 @@ def known_crs(crs: str, *, geocentric: bool = True):
 
 
 def outside_area(crs: str, lat_deg: float, lon_deg: float) -> tuple[float, str]:
-    """How far, in degrees, a place lies outside of the area that a CRS is made for, and the name of that area.
+    """How far, in degrees, a place lies outside of the area that a CRS is made for, and the bounds of that area in words.
 
     0 inside it, and where nobody states an area.
 
@@ -287,7 +287,8 @@ def outside_area(crs: str, lat_deg: float, lon_deg: float) -> tuple[float, str]:
     width = (area.east - area.west) % 360.0 or 360.0
     east = (lon_deg - area.west) % 360.0
     beside = 0.0 if east <= width else min(east - width, 360.0 - east)
-    return max(beside, lat_deg - area.north, area.south - lat_deg, 0.0), area.name
+    bounds = f"latitude {area.south:g} to {area.north:g}, longitude {area.west:g} to {area.east:g} deg"
+    return max(beside, lat_deg - area.north, area.south - lat_deg, 0.0), bounds
 
 
 def _refuse_left_handed(known, crs: str) -> None:
