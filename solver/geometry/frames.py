@@ -273,7 +273,7 @@ def known_crs(crs: str, *, geocentric: bool = True):
 
 
 def outside_area(crs: str, lat_deg: float, lon_deg: float) -> tuple[float, str]:
-    """How far, in degrees, a place lies outside of the area that a CRS is made for, and the bounds of that area in words.
+    """How far, in degrees, a place lies outside of the area that a CRS is made for, and the bounds of that in words.
 
     0 inside it, and where nobody states an area.
 
