@@ -42,7 +42,7 @@ def usual() -> tuple[Simulation, list[TimedPose]]:
 @functools.cache
 def usual_online() -> OnlineResult:
     """That flight through the window."""
-    return adjust_online(*usual(), OPTIONS, live=False, update_s=0.5)
+    return adjust_online(*usual(), OPTIONS, live=False, update_s=1.0)
 
 
 @functools.cache

@@ -62,7 +62,7 @@ def _drifting(line: float, sample: float, from_s: float = 5.0):
 
 def _fly(simulation: Simulation, poses):
     """Result, and alarms as (time, sources)."""
-    result = adjust_online(simulation, poses, live=False, update_s=0.5)
+    result = adjust_online(simulation, poses, live=False, update_s=1.0)
     reports = [r.quality for r in result.reports]
     return result, [(w.time_s, w.sources) for w in reports if w.sources]
 
@@ -234,7 +234,7 @@ def test_the_camera_is_without_what_drifted_in_the_strip_before():
         return np.multiply.outer(((t > begin_s) & (t < end_s)) * 0.03 * (t - begin_s), [0.0, 1.0])
 
     spoilt = _shifted(simulation, shift, "N")
-    result = adjust_online(spoilt, navigate(simulation), self_calibration=camera, live=False, update_s=0.5)
+    result = adjust_online(spoilt, navigate(simulation), self_calibration=camera, live=False, update_s=1.0)
     # over a few redundant observations sigma0 says nothing
     found = np.array([r.sigma0 for r in result.reports if r.strip == "S3" and r.redundancy > 5])
     assert len(found) > 50 and found.min() > 0.6 and found.max() < 1.5
@@ -272,7 +272,7 @@ def test_one_line_of_one_of_two_sources_is_named_alone_and_the_other_source_hold
     second = _with_sources(monkeypatch, simulation)
     result, alarms = _fly(_shifted(simulation, _drifting(0.0, 0.05), "F", second), poses)
     assert alarms[-1][1][0].suspects == (("matcher-2", "F"),)
-    clean = adjust_online(simulation, poses, live=False, update_s=0.5)
+    clean = adjust_online(simulation, poses, live=False, update_s=1.0)
     with_, without = (orientation_errors(simulation, r.whole).rmse for r in (result, clean))
     assert np.linalg.norm(with_[:3]) < 1.3 * np.linalg.norm(without[:3])
 

@@ -74,7 +74,7 @@ def test_points_of_single_looks_lie_where_the_looks_meet(monkeypatch):
     unsteady = replace(simulation, images=simulation.images.select(nadir)), poses
     make, open_ = BatchMaker.make_single, left_by_calibration(simulation.flight.camera)
     monkeypatch.setattr(BatchMaker, "make_single", lambda *a: make(*a[:-1], a[-1] + [0.0, 0.0, 100.0]))
-    online = adjust_online(*unsteady, replace(OPTIONS, snoop=True), open_, live=False, update_s=0.5)
+    online = adjust_online(*unsteady, replace(OPTIONS, snoop=True), open_, live=False, update_s=1.0)
     batch = adjust_at_once(*unsteady, OPTIONS, open_)
     assert not any("do not agree" in text for text in online.events)
     met = [name for name, point in online.whole_points.items() if point.rays == 2]

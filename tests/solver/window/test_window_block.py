@@ -59,7 +59,7 @@ def bounded(flight):
         patch.setattr(window_archive, "BLOCK_UNKNOWNS", 200)
         patch.setattr(window_block.Block, "refined", watched)
         patch.setattr(window_archive.Archive, "solving", lambda *a: solved.append(1) or solving(*a))
-        result = adjust_online(*flight, OPTIONS, live=False, update_s=0.5)
+        result = adjust_online(*flight, OPTIONS, live=False, update_s=1.0)
     return result, published, solved
 
 
@@ -99,9 +99,9 @@ def test_the_backward_pass_of_the_block_is_that_of_the_window_where_there_is_one
     poses = navigate(one)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(window_archive, "PRIOR_TOGETHER", 7)
-        block = adjust_online(one, poses, OPTIONS, live=False, update_s=0.5)
+        block = adjust_online(one, poses, OPTIONS, live=False, update_s=1.0)
         patch.setattr(window_block, "MOST_OF_STRIP", 10)
-        chain = adjust_online(one, poses, OPTIONS, live=False, update_s=0.5)
+        chain = adjust_online(one, poses, OPTIONS, live=False, update_s=1.0)
     assert any("refined alone" in text for text in chain.events)
     difference, sigma = far_apart(block.whole, chain.whole)
     assert difference < 1e-4 and sigma < 1e-6
@@ -125,7 +125,7 @@ def test_sigmas_that_a_later_strip_shows_to_be_larger_count_for_the_earlier_ones
                 for strip in network.flown:
                     strip.restate_sigmas(network.sigmas.apriori, network.state)
 
-        return adjust_online(simulation, poses, OPTIONS, live=False, update_s=0.5, watch=larger).whole
+        return adjust_online(simulation, poses, OPTIONS, live=False, update_s=1.0, watch=larger).whole
 
     (begin, _), (second, _) = simulation.flight.strip_times_s
     from_the_start = whole(begin + 2.0)
@@ -149,7 +149,7 @@ def test_a_later_strip_knows_what_the_earlier_ones_say_of_its_points(flight, onl
         simulation,
         images=simulation.images.select(simulation.images.looks.strip == simulation.images.looks.strip.max()),
     )
-    alone = adjust_online(alone, poses, OPTIONS, live=False, update_s=0.5)
+    alone = adjust_online(alone, poses, OPTIONS, live=False, update_s=1.0)
     rmse = [orientation_errors(simulation, [o for o in r.final if o.strip == "C1"]) for r in (online, alone)]
     sigma = [np.sqrt(np.einsum("nii->ni", e.covariance)).mean(axis=0) for e in rmse]
     assert (sigma[0][:3] < 0.8 * sigma[1][:3]).all()
@@ -160,7 +160,7 @@ def test_several_strips_are_consistent():
     nees = []
     for seed in range(3):
         simulation = simulate(PLAN, seed, SENSORS, TIES)
-        result = adjust_online(simulation, navigate(simulation), OPTIONS, live=False, update_s=0.5)
+        result = adjust_online(simulation, navigate(simulation), OPTIONS, live=False, update_s=1.0)
         kinds = [orientation_errors(simulation, result.final), orientation_errors(simulation, result.whole)]
         kinds += [point_errors(simulation, p) for p in (result.final_points, result.whole_points)]
         nees.append([k.nees.mean() for k in kinds])
@@ -193,7 +193,7 @@ def test_control_that_comes_after_its_strip_is_over_counts_as_in_the_batch(fligh
         elif sigma.get("after", 0.0) is None:
             sigma["after"] = window.live(now - 0.8).covariance[0, 0, 0]
 
-    late = adjust_online(blind, poses, OPTIONS, live=False, update_s=0.5, watch=watch)
+    late = adjust_online(blind, poses, OPTIONS, live=False, update_s=1.0, watch=watch)
     assert any("came after its point was final: it counts" in text for text in late.events)
     assert sigma["after"] < 0.7 * sigma["before"]  # on line, through the points both strips see
     difference, share = far_apart(late.whole, batch.final)
@@ -222,7 +222,7 @@ def test_control_that_is_corrected_after_its_point_was_final_leaves_no_trace(fli
             window.add_control(passed, place_l, np.full(3, np.inf), "check")
             changed.append(now)
 
-    result = adjust_online(simulation, poses, OPTIONS, live=False, update_s=0.5, watch=watch)
+    result = adjust_online(simulation, poses, OPTIONS, live=False, update_s=1.0, watch=watch)
     assert any("was changed after its point was final: it counts" in text for text in result.events)
     difference, share = far_apart(result.whole, online.whole)
     assert difference < 0.3 and share < 0.02
@@ -252,7 +252,7 @@ def test_a_block_keeps_its_bounds_and_says_so(flight, bounded):
 def test_where_one_strip_cannot_leave_what_it_says_all_are_closed_and_the_camera_is_kept():
     simulation, poses = flown(SIDE_BY_SIDE)
     camera = focal_length(simulation.flight.camera)
-    archive = adjust_online(simulation, poses, OPTIONS, camera, live=False, update_s=0.5).window._block._archive
+    archive = adjust_online(simulation, poses, OPTIONS, camera, live=False, update_s=1.0).window._block._archive
     values, Q = in_one_go(archive.solving()).of(archive._shared)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(window_archive, "MOST_MET", 10)
@@ -260,7 +260,7 @@ def test_where_one_strip_cannot_leave_what_it_says_all_are_closed_and_the_camera
         patch.setattr(window_archive, "BLOCK_UNKNOWNS", 50)
         patch.setattr(window_archive, "MOST_POINTS", 20)
         patch.setattr(window_block, "MOST_POINTS", 20)
-        result = adjust_online(simulation, poses, OPTIONS, camera, live=False, update_s=0.5)
+        result = adjust_online(simulation, poses, OPTIONS, camera, live=False, update_s=1.0)
     told = " | ".join(result.events)
     assert "the block has over 20 points" in told and "strips S1, S2 are refined no more" in told
     again, Q_again = in_one_go(result.window._block._archive.solving()).of(archive._shared)
@@ -281,7 +281,7 @@ def test_a_strip_too_long_for_a_block_leaves_those_before_it_as_they_are():
             if now_s > end + 5.0:
                 patch.setattr(window_block, "MOST_OF_STRIP", 60)
 
-        result = adjust_online(simulation, poses, OPTIONS, live=False, update_s=0.5, watch=watch)
+        result = adjust_online(simulation, poses, OPTIONS, live=False, update_s=1.0, watch=watch)
     assert any("S2 has more than 60 unknowns" in text for text in result.events)
     assert not result.window._block._archive.strips
     assert {o.strip for o in result.whole} == {"S1", "S2"}
@@ -315,7 +315,7 @@ def test_a_point_taken_for_another_ties_nothing(flight, online):
         simulation,
         images=replace(simulation.images.select(order), looks=replace(looks, point=point).select(order)),
     )
-    result = adjust_online(mixed, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
+    result = adjust_online(mixed, poses, replace(OPTIONS, snoop=True), live=False, update_s=1.0)
     named = " ".join(text for text in result.events if "do not agree with earlier strips" in text)
     for name in (str(simulation.points.id[one]), str(simulation.points.id[other])):
         assert name in named and result.whole_points[name].checked == "doubtful"
@@ -334,7 +334,7 @@ def test_a_point_that_strips_contradict_each_other_at_is_where_more_looks_say(fl
     keep[again[0]] = False
     sample = images.sample + 60.0 * np.isin(np.arange(len(images)), again)
     wrong = replace(simulation, images=replace(images, sample=sample).select(keep))
-    result = adjust_online(wrong, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
+    result = adjust_online(wrong, poses, replace(OPTIONS, snoop=True), live=False, update_s=1.0)
     name = str(simulation.points.id[point])
     assert any("do not agree with earlier strips" in text and name in text for text in result.events)
     whole, off = result.whole_points[name], result.whole_points[name].xyz_l - simulation.points.xyz_l[point]
@@ -359,7 +359,7 @@ def seen_again_once(simulation, role):
 def test_a_control_point_seen_again_in_one_look_ties_and_is_not_weighted_again(flight):
     simulation, poses = flight
     thinned, seen, _ = seen_again_once(simulation, "control")
-    result = adjust_online(thinned, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
+    result = adjust_online(thinned, poses, replace(OPTIONS, snoop=True), live=False, update_s=1.0)
     assert seen
     for p in seen:
         name = str(simulation.points.id[p])
@@ -380,7 +380,7 @@ def test_control_whose_looks_in_a_later_strip_are_all_refused_leaves_the_block_a
     keep[again[1:]] = False
     sample = images.sample + 1000.0 * (np.arange(len(images)) == again[0])
     wrong = replace(simulation, images=replace(images, sample=sample).select(keep))
-    result = adjust_online(wrong, poses, replace(OPTIONS, snoop=True), live=False, update_s=0.5)
+    result = adjust_online(wrong, poses, replace(OPTIONS, snoop=True), live=False, update_s=1.0)
     name = str(simulation.points.id[point])
     assert "snooping" in [r.reason for r in result.refused if r.point == name]
     assert {r.look.strip for r in result.whole_points[name].residuals} == {"S1"}
@@ -393,10 +393,10 @@ def test_a_single_look_ties_a_later_strip_unless_it_contradicts(flight):
     simulation, poses = flight
     thinned, seen, looks = seen_again_once(simulation, "tie")
     options = replace(OPTIONS, snoop=True)
-    result = adjust_online(thinned, poses, options, live=False, update_s=0.5)
+    result = adjust_online(thinned, poses, options, live=False, update_s=1.0)
     single = np.isin(np.arange(len(thinned.images)), looks)
     none = replace(thinned, images=thinned.images.select(~single))
-    without = adjust_online(none, poses, options, live=False, update_s=0.5)
+    without = adjust_online(none, poses, options, live=False, update_s=1.0)
     sigma = [
         np.sqrt(np.einsum("nii->ni", np.concatenate([o.covariance for o in r.final if o.strip == "S2"]))).mean(axis=0)
         for r in (result, without)
@@ -407,7 +407,7 @@ def test_a_single_look_ties_a_later_strip_unless_it_contradicts(flight):
     wrong = next(i for i in looks if thinned.images.looks.point[i] in seen and thinned.images.looks.strip[i] == 1)
     sample[wrong] += 40.0
     spoilt = replace(thinned, images=replace(thinned.images, sample=sample))
-    spoilt = adjust_online(spoilt, poses, options, live=False, update_s=0.5)
+    spoilt = adjust_online(spoilt, poses, options, live=False, update_s=1.0)
     name = str(simulation.points.id[thinned.images.looks.point[wrong]])
     assert any("do not agree with earlier strips" in e and name in e for e in spoilt.events)
     assert far_apart(spoilt.final, result.final)[0] < 1.0
