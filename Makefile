@@ -22,8 +22,8 @@ help:
 	@echo "make schemas compile the protobuf files"
 	@echo "make golden  make the golden recording and its results anew"
 
-# A virtual environment with the package, $(1); made again when the dependencies change. pip compiles byte code on one core
-# and that of the packages' tests, too; what compileall has made none of the processes of a flight or of the tests makes again.
+# A virtual environment with the package, $(1); made again when the dependencies change. pip would compile byte code on one
+# core, and that of the packages' own tests, too. With triline compiled here, its processes need not do it one by one.
 define install
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip

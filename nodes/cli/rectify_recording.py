@@ -12,7 +12,7 @@ import numpy as np
 from ...solver.camera.line_camera import LineCamera
 from ...solver.geometry.ellipsoid import WGS84
 from ...solver.geometry.frames import LocalFrame
-from ...solver.matching.round_earth import RADIUS_M
+from ...solver.matching.round_earth import tilt
 from ...solver.orthoimage.error_band import GroundErrors
 from ...solver.orthoimage.ground_grid import GroundGrid, metres_a_unit, utm_of
 from ...solver.orthoimage.orientation import LineOrientation
@@ -182,10 +182,7 @@ def _tilts(recording: Recording, camera: LineCamera, imaged: list[str]) -> dict[
             time_s = (block.times_ns() - reference_ns) * 1e-9
             if (posed := own.covers(time_s)).any():
                 position, R = own.at(time_s[posed][:1])
-                ray = R[0] @ [*middle, -camera.focal_length_mm[ccd]]
-                down = -position[0] - [0.0, 0.0, RADIUS_M]
-                cosine = ray @ down / (np.linalg.norm(ray) * np.linalg.norm(down))
-                tilts[id] = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+                tilts[id] = tilt(position[0], R[0] @ [*middle, -camera.focal_length_mm[ccd]])
                 break
     return tilts
 

@@ -225,7 +225,7 @@ def quaternion_from_angles(angles: ArrayLike) -> Array:
 def quaternion_from_matrix(R: ArrayLike) -> Array:
     """Unit quaternions ``xyzw`` with a non-negative scalar part, (..., 3, 3) to (..., 4).
 
-    The matrices are rotations; nobody looks whether they are, which takes four times as long for one of them.
+    The matrices have to be rotations: a check of that would take four times as long as the conversion of one.
     """
     from scipy.spatial.transform import Rotation
 

@@ -13,7 +13,7 @@ from .line_scan import LineScan, View
 from .line_store import LineRing
 from .line_times import LineTimes
 from .places import PlaceChooser
-from .round_earth import RADIUS_M, above_sphere
+from .round_earth import above_sphere, tilt
 from .search import Image, TurnedImage
 
 Array = NDArray[np.floating]
@@ -146,9 +146,7 @@ class StripView:
 
     def tilt(self) -> float:
         """Angle between its middle and the way down, rad."""
-        position, ray = self.middle()
-        down = -position - np.array([0.0, 0.0, RADIUS_M])
-        return float(np.arccos(np.clip(ray @ down / np.linalg.norm(down), -1.0, 1.0)))
+        return tilt(*self.middle())
 
     def image(self, scan: LineScan, travel: float) -> TurnedImage:
         """Its lines, for patches along any other strip; the platform's way from line to line is given."""

@@ -28,6 +28,12 @@ def above_sphere(position_l: ArrayLike) -> float:
     return float(np.linalg.norm(np.add(position_l, [0.0, 0.0, RADIUS_M])) - RADIUS_M)
 
 
+def tilt(position_l: ArrayLike, ray_l: ArrayLike) -> float:
+    """Angle between a ray (3,) of any length and the way down from a position (3,) to the middle of the sphere, rad."""
+    down, ray = -np.add(position_l, [0.0, 0.0, RADIUS_M]), np.asarray(ray_l)
+    return float(np.arccos(np.clip(ray @ down / (np.linalg.norm(ray) * np.linalg.norm(down)), -1.0, 1.0)))
+
+
 def way_of_platform(forward: float, height_m: float) -> float:
     """How far a platform flies until it is above what it sees in a direction, m.
 

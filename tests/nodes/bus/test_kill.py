@@ -255,6 +255,16 @@ def test_a_recording_that_is_deleted_at_last_is_told(tmp_path):
     assert recorder.last_problem == f"{tmp_path / 'a.mcap'}: was deleted while it was written"
 
 
+def test_a_disk_that_numbers_its_files_anew_has_deleted_none(tmp_path, monkeypatch):
+    """Network disks do; the recorder would begin another file each half second."""
+    monkeypatch.setattr(module.os.path, "samestat", lambda *_: False)
+    recorder = Recorder(str(tmp_path / "a.mcap"))
+    recorder.start()
+    recorder.take(raws(20))
+    recorder.close()
+    assert recorder.counters["disk"] == 0 and recorder.files == [tmp_path / "a.mcap"]
+
+
 def test_a_recorder_that_is_slower_than_publishers_makes_them_wait_and_loses_nothing(tmp_path, monkeypatch):
     """What it says of itself comes back to it over the bus while more waits for the disk than may."""
     monkeypatch.setattr(module, "WAITING_BYTES", 2000)

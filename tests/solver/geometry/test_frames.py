@@ -16,6 +16,7 @@ from triline.solver.geometry.frames import (
     R_lc_from_navigation,
     navigation_from_R_lc,
     opk_covariance_from_navigation,
+    outside_area,
 )
 from triline.solver.geometry.rotation import angles_from_matrix, matrix_from_angles, matrix_from_navigation
 
@@ -229,3 +230,19 @@ def test_heights_end_where_their_geoid_ends(tmp_path):
     done = subprocess.run([sys.executable, "-c", BORDER, str(tmp_path)], capture_output=True, text=True, check=True)
     outside = "coordinates outside the area of 'EPSG:25832+7837'"
     assert done.stdout.splitlines() == ["547.0 500.0", outside, outside]
+
+
+@pytest.mark.parametrize(
+    ("crs", "place", "outside_deg"),
+    [
+        ("EPSG:32632", (48.0, 9.0), 0.0),
+        ("EPSG:32632", (48.0, 13.5), 1.5),
+        ("EPSG:32632", (-10.0, 9.0), 10.0),
+        ("EPSG:32601", (10.0, 179.0), 1.0),  # 180 W to 174 W
+        ("EPSG:3832", (0.0, -179.0), 0.0),  # the Pacific, on both sides of the date line
+        ("EPSG:4326", (0.0, 190.0), 0.0),
+        ("+proj=utm +zone=32", (48.0, 90.0), 0.0),  # nobody states an area
+    ],
+)
+def test_how_far_a_place_is_outside_the_area_of_a_crs(crs, place, outside_deg):
+    assert outside_area(crs, *place)[0] == pytest.approx(outside_deg, abs=0.01)
