@@ -374,8 +374,8 @@ class Archive:
         In parts, each with what it costs.
         """
         refined, wanted = WholeStrips([], []), set(strips)
-        for name, strip in self.strips.items():
-            for orientation in strip.orientation if name in wanted else ():
+        for strip in [strip for name, strip in self.strips.items() if name in wanted]:  # others begin meanwhile
+            for orientation in strip.orientation:
                 refined.orientation.append(orientation.refined(solution))
                 yield REFINED_ORIENTATION
         mine = {name: k.left for name, k in self.points.items() if k.strips & wanted and k.single is None}

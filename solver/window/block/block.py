@@ -110,6 +110,7 @@ class Block:
             return
         kept.orientation.append(final)
         if len(strip.entered) > MOST_OF_STRIP:
+            self.conclude()
             self._archive.begin_again()
             self.events.append(
                 f"strip {strip.id} has more than {MOST_OF_STRIP} unknowns: it is refined alone, those before it no more"

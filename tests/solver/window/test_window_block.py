@@ -241,6 +241,21 @@ def test_a_strip_that_is_closed_leaves_what_it_says_of_the_others(online):
     assert Q_again / sigma / sigma[:, None] == pytest.approx(Q / sigma / sigma[:, None], abs=1e-7)
 
 
+def test_a_strip_may_begin_while_others_are_refined(online):
+    archive = deepcopy(online.window._block._archive)
+    solution, over = in_one_go(archive.solving()), archive.over
+    at_once = in_one_go(archive.refining(solution, over))
+    work = archive.refining(solution, over)
+    next(work)
+    archive.strips["next"] = window_archive.KeptStrip(len(over), np.arange(4) + 1_000_000)
+    portions = in_one_go(work)
+    assert [(o.strip, float(o.time_s[0])) for o in portions.orientation] == [
+        (o.strip, float(o.time_s[0])) for o in at_once.orientation
+    ]
+    assert {o.strip for o in portions.orientation} == set(over)
+    assert [p.name for p in portions.points] == [p.name for p in at_once.points]
+
+
 def test_a_block_keeps_its_bounds_and_says_so(flight, bounded):
     result, _, _ = bounded
     assert sum("refined no more" in text for text in result.events) == 2
