@@ -449,7 +449,7 @@ class Adjuster(Node):
         elif time_s < self._next_live:
             return []
         else:
-            due = self.options.grid(max(self._next_live, time_s - 1.0), time_s + 1e-6)
+            due = self.options.grid(max(self._next_live, time_s - 1.0), time_s + 2e-6 / hz)
             self._next_live = (np.floor(time_s * hz + 1e-6) + 1) / hz - 1e-6
         if not len(due) or self._window.strip_at(time_s) is None:
             return []

@@ -279,6 +279,16 @@ def test_an_imported_trajectory_without_filter_output_works_too(flight):
     assert len(bodies(outputs, "orientation/final")) > 270
 
 
+@pytest.mark.parametrize("grid_hz", [1.0, 0.5, 3.0])
+def test_live_orientation_comes_at_every_time_of_a_coarse_grid(flight, grid_hz):
+    simulation, messages = flight
+    ((begin, end),) = simulation.flight.strip_times_s
+    outputs = run(Adjuster(grid_hz=grid_hz), [x for x in messages if not x.topic.startswith("observation/")])
+    live = [seconds(p) for p in bodies(outputs, "orientation/live")]
+    assert live[0] < begin + 1.0 / grid_hz and live[-1] > end - 1.0 / grid_hz
+    assert np.diff(live) == pytest.approx(1.0 / grid_hz, abs=1e-6)
+
+
 def test_settings_are_checked():
     with pytest.raises(ValueError, match="update_s"):
         Adjuster(update_s=0.0)
