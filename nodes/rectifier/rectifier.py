@@ -217,7 +217,7 @@ class Rectifier(Node):
                 self.problem("unknown strip", f"lines of {ccd} name strip {strip!r}")
             return
         if block.pixels.shape[1] != line.pixels:
-            raise ValueError(f"lines of {block.pixels.shape[1]} pixels, wanted {line.pixels}")
+            raise ValueError(f"lines of {ccd} of {block.pixels.shape[1]} samples, wanted {line.pixels}")
         first = int(block.first_line)
         late = min(max(self._next_line.get(block.strip, first) - first, 0), len(block.pixels))
         if late:

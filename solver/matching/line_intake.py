@@ -96,8 +96,9 @@ class LineIntake:
         """
         if ccd not in self._samples:
             raise ValueError(f"unknown CCD line {ccd!r}")
-        if pixels.ndim != 2 or pixels.shape[1] != self._samples[ccd]:
-            raise ValueError(f"lines of {ccd} of shape {pixels.shape}, wanted {self._samples[ccd]} samples")
+        if pixels.shape[1:] != (self._samples[ccd],):
+            width = " x ".join(map(str, pixels.shape[1:])) or "no"
+            raise ValueError(f"lines of {ccd} of {width} samples, wanted {self._samples[ccd]}")
         if pixels.dtype not in (np.uint8, np.uint16):
             raise ValueError(f"lines of {ccd} of {pixels.dtype}, wanted uint8 or uint16")
         if not len(pixels) or first_line < 0:

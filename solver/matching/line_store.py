@@ -95,8 +95,8 @@ class LineRing:
         ------
         ValueError : lines of another length
         """
-        if pixels.ndim != 2 or pixels.shape[1] != self.samples:
-            raise ValueError(f"lines of shape {pixels.shape}, wanted {self.samples} samples")
+        if pixels.shape[1:] != (self.samples,):
+            raise ValueError(f"lines of {' x '.join(map(str, pixels.shape[1:])) or 'no'} samples, wanted {self.samples}")
         usable = np.ones(len(pixels), dtype=bool) if usable is None else usable
         if self.start == self.end:
             self.start = self.end = self._seen_end = first_line

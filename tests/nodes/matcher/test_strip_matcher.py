@@ -486,7 +486,7 @@ def test_bad_input():
     matcher.begin_strip("S/F", LineTimes(0.0, 100.0))
     with pytest.raises(ValueError, match="unknown CCD line 'N'"):
         matcher.add_lines("N", 0, np.zeros((2, 12000), np.uint16))
-    with pytest.raises(ValueError, match="wanted 12000 samples"):
+    with pytest.raises(ValueError, match="samples, wanted 12000"):
         matcher.add_lines("F", 0, np.zeros((2, 100), np.uint16))
     matcher.add_lines("F", 0, np.zeros((2, 12000), np.uint16))  # lines without any pose
     assert matcher.end_strip("S/F") == [] and matcher.end_strip("never begun") == []

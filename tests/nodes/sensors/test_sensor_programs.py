@@ -215,7 +215,7 @@ def flown(folder, nodes=(), place=None):
 
 def test_image_lines_that_no_node_can_use_are_told_in_flight_and_at_its_end(folder):
     """A camera.json of 200 px for lines of 180: all of them were refused, and a flight ended without a word of it."""
-    why = "sensor/lines/N: lines of N of shape (10, 180), wanted 200 samples"
+    why = "sensor/lines/N: lines of N of 180 samples, wanted 200"
     status = m.NodeStatus(node="matcher", last_problem=why)
     status.counters.add(name="cells without texture", value=3)
     status.counters.add(name="malformed", value=130)
