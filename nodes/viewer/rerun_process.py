@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from ..errors import UserError
@@ -45,11 +46,15 @@ class ViewerProcess:
                 "no display for the native viewer; triline view: use --web or --rrd FILE, "
                 "triline node viewer: --set mode=web or --set mode=rrd:FILE"
             )
-        self.grpc_port = grpc_port or _free_port(_FIRST_PORTS["grpc"])
-        self.web_port = (web_port or _free_port(_FIRST_PORTS["web"])) if web else 0
         self._home = _private_folder()
         environment = {**os.environ, "XDG_CONFIG_HOME": str(self._home)}
         subprocess.run([binary, "analytics", "disable"], env=environment, capture_output=True, timeout=20, check=False)
+        with _one_at_a_time(self._home):
+            self.grpc_port = grpc_port or _free_port(_FIRST_PORTS["grpc"])
+            self.web_port = (web_port or _free_port(_FIRST_PORTS["web"])) if web else 0
+            self._start(binary, web, environment)
+
+    def _start(self, binary: str, web: bool, environment: dict[str, str]) -> None:
         command = [binary, "--bind", LOOPBACK, "--port", str(self.grpc_port), "--hide-welcome-screen"]
         if web:
             command += ["--serve-web", "--web-viewer-port", str(self.web_port)]
@@ -150,6 +155,18 @@ def _private_folder() -> Path:
         return folder
     except OSError:
         return Path(tempfile.mkdtemp(prefix="triline-viewer-"))
+
+
+@contextlib.contextmanager
+def _one_at_a_time(folder: Path) -> Iterator[None]:
+    """Let one program after the other choose ports and listen there: two that start at once would choose the same ones,
+    and draw into one viewer. The system lets go of it when a program ends."""
+    with open(folder / "starting", "wb") as file:
+        with contextlib.suppress(ImportError):  # a system without such locks
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def _listening(port: int) -> bool:

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 import urllib.request
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +25,10 @@ from synthetic_flight import START_NS, flight_messages, spoilt_copy
 from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.node import Message
-from triline.nodes.viewer import scene
+from triline.nodes.viewer import rerun_process, scene
 from triline.nodes.viewer.canvas import NullCanvas
 from triline.nodes.viewer.rerun_canvas import RerunCanvas, open_canvas
-from triline.nodes.viewer.rerun_process import ViewerProcess, _private_folder, viewer_binary
+from triline.nodes.viewer.rerun_process import ViewerProcess, _free_port, _private_folder, viewer_binary
 from triline.nodes.viewer.viewer import Viewer
 from triline.schemas import codec
 
@@ -241,8 +242,12 @@ def test_web_viewer_listens_on_loopback_only_and_goes_with_us(messages):
     assert not any(_alive(pid) for pid in pids)
 
 
-def test_two_web_viewers_take_different_ports():
-    first, second = ViewerProcess(web=True), ViewerProcess(web=True)
+def test_two_web_viewers_that_start_at_once_take_different_ports(monkeypatch):
+    """Both had the same ports: the second ended, and what it was to show went into the first."""
+    free = _free_port(0), _free_port(0)  # as the usual ones are where no viewer runs
+    monkeypatch.setattr(rerun_process, "_FIRST_PORTS", dict(zip(("grpc", "web"), free, strict=True)))
+    with ThreadPoolExecutor() as pool:
+        first, second = pool.map(lambda _: ViewerProcess(web=True), range(2))
     try:
         assert len({first.grpc_port, first.web_port, second.grpc_port, second.web_port}) == 4
     finally:
