@@ -33,6 +33,9 @@ _WINDOW = ("window", "window_upper", "window_lower")  # curves of the window's p
 _OVERVIEW = ("dX_window", "dY_window", "dZ_window")
 _LEGEND_ROOM, _LONGEST_S = 1.3, 300.0
 _MAP_POINTS = 300.0  # height and width of the map, about
+_TAB_ROOM, _SIDE_ROOM, _LINES_ROOM = (1380.0, 790.0), (640.0, 420.0), (690.0, 650.0)  # for views of CCD lines, points
+_TITLE_POINTS = 22.0  # height of a view's title
+_MOST_ROWS = 3.5  # of image-space views beside the curves: more rows are lower
 
 
 class RerunCanvas:
@@ -267,7 +270,6 @@ def _navigation(layout: ViewLayout) -> rrb.Container:
 
 
 def _overview(layout: ViewLayout) -> rrb.Container:
-    images = [] if layout.lines else [_image(ccd, title, layout) for ccd, title in layout.ccds.items()]
     side = rrb.Tabs(
         rrb.TextLogView(origin="/log", name="Events"),
         rrb.TextDocumentView(origin="/about", name="About this view"),
@@ -288,12 +290,15 @@ def _overview(layout: ViewLayout) -> rrb.Container:
         grid_columns=2,
     )
     if layout.lines:
-        lines = rrb.Horizontal(*(_lines(ccd, layout) for ccd in layout.lines))
+        columns = columns_of(len(layout.lines), layout.lines_size, _LINES_ROOM)
+        lines = rrb.Grid(*(_lines(ccd, layout) for ccd in layout.lines), grid_columns=columns)
         left = rrb.Vertical(_light(), _flight(layout), _legend(layout), curves, row_shares=[2.5, 10, 1.5, 7.6])
         right = rrb.Vertical(lines, side, row_shares=[10, 2.2])
         return rrb.Horizontal(left, right, column_shares=[1, 1], name="Overview")
     left = rrb.Vertical(_light(), _flight(layout), _legend(layout), side, row_shares=[1.9, 10, 1.3, 2.6])
-    right = rrb.Vertical(*images, curves, row_shares=[1.0] * len(images) + [2.7])
+    columns = columns_of(len(layout.ccds), layout.image_size, _SIDE_ROOM)
+    rows = min(-(-len(layout.ccds) // columns), _MOST_ROWS)
+    right = rrb.Vertical(_images(layout, columns), curves, row_shares=[rows, 2.7])
     return rrb.Horizontal(left, right, column_shares=[1.15, 1], name="Overview")
 
 
@@ -323,7 +328,22 @@ def _mosaic(layout: ViewLayout) -> rrb.Container:
 
 
 def _residuals(layout: ViewLayout) -> rrb.Container:
-    return rrb.Vertical(*(_image(ccd, title, layout) for ccd, title in layout.ccds.items()), name="Residuals")
+    return rrb.Vertical(_images(layout, columns_of(len(layout.ccds), layout.image_size, _TAB_ROOM)), name="Residuals")
+
+
+def _images(layout: ViewLayout, columns: int) -> rrb.Container:
+    """Image-space views of all CCD lines."""
+    return rrb.Grid(*(_image(ccd, title, layout) for ccd, title in layout.ccds.items()), grid_columns=columns)
+
+
+def columns_of(views: int, size: tuple[float, float], room: tuple[float, float]) -> int:
+    """In how many columns views of one size (width, height; any unit) are shown largest in a room (screen points)."""
+
+    def scale(columns: int) -> float:
+        height = room[1] / -(-views // columns) - _TITLE_POINTS
+        return min(room[0] / columns / size[0], height / size[1])
+
+    return max(range(1, views + 1), key=scale, default=1)
 
 
 def _lines(ccd: str, layout: ViewLayout) -> rrb.View:

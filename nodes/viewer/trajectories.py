@@ -111,7 +111,7 @@ class FlightPart(Part):
         if pose is None or camera is None or self._head.get("trajectory") is None:
             return
         R = matrix_from_quaternion(pose.quaternion)
-        fans, colors = [], []
+        fans, colors, names = [], [], []
         for k, line in enumerate(camera.lines):
             ends = line.xy_mm[[0, -1]] - camera.principal_point_mm[k]
             rays = np.column_stack([ends, np.full(2, -camera.focal_length_mm[k])]) @ R.T
@@ -122,8 +122,8 @@ class FlightPart(Part):
             fan = np.array([pose.position_l, ground[0], ground[1], pose.position_l])
             fans.append(self.state.display(fan))
             colors.append(CCD_COLORS[k % len(CCD_COLORS)])
-        if fans:
-            canvas.lines("flight/looks", fans, colors, 0.8, [line.id for line in camera.lines][: len(fans)])
+            names.append(line.id)
+        canvas.lines("flight/looks", fans, colors, 0.8, names)
 
 
 def ellipsoid(covariance: Array, scale: float) -> tuple[Array, Array]:

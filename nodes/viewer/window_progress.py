@@ -120,7 +120,7 @@ class WindowPart(Part):
         if report is not None:
             start_ns = report.window_start_ns if report.strip else 0
             empty = not report.strip and report.points == 0 and report.update > 0
-            over = empty and track[-1][0] < report.window_end_ns + SECOND_NS
+            over = empty and track[-1][0] < max(report.window_end_ns + SECOND_NS, report.window_start_ns)
         gone = [row for row in track if row[0] <= start_ns] if not over else track
         live = [row for row in track if row[0] > start_ns] if not over else []
         if gone and live:

@@ -17,6 +17,7 @@ class Notebook(NullCanvas):
         self.times = defaultdict(int)
         self.curves = defaultdict(lambda: ([], []))
         self.styles, self.events, self.layouts, self.closed = {}, [], [], 0
+        self.names = {}  # of lines
         self.moments = []
 
     def at(self, time_s):
@@ -31,7 +32,9 @@ class Notebook(NullCanvas):
         self._note(entity, np.array(xyz), list(colors), labels)
 
     def lines(self, entity, strips, colors, radius, labels=None):
+        assert labels is None or len(labels) == len(strips)
         self._note(entity, [np.array(s) for s in strips], colors)
+        self.names[entity] = labels
 
     def arrows(self, entity, origins, vectors, colors, radius, labels=None):
         assert len(origins) == len(vectors) == len(colors)

@@ -14,11 +14,12 @@ from synthetic_flight import START_NS, flight_messages
 
 from triline.nodes import convert
 from triline.nodes.cli.view import show
+from triline.nodes.convert import PoseSample
 from triline.nodes.node import Message
-from triline.nodes.viewer.rerun_canvas import _ASPECT, _FIELD_OF_VIEW, viewpoint
+from triline.nodes.viewer.rerun_canvas import _ASPECT, _FIELD_OF_VIEW, _overview, viewpoint
 from triline.nodes.viewer.scene_part import CHECK, CONTROL, FINAL, LIVE, REJECTED, Pieces
-from triline.nodes.viewer.scene_state import PoseHistory, round_number
-from triline.nodes.viewer.trajectories import ellipsoid
+from triline.nodes.viewer.scene_state import PoseHistory, SceneState, round_number
+from triline.nodes.viewer.trajectories import FlightPart, ellipsoid
 from triline.solver.camera.sensors import preset
 from triline.solver.geometry.rotation import matrix_from_quaternion
 
@@ -315,6 +316,18 @@ def test_the_strip_is_in_view(notes):
     assert x.max() > 0.7 * half * _ASPECT or y.max() > 0.7 * half  # and not a dot in the distance
 
 
+@pytest.mark.parametrize(("lines", "residuals", "images"), [(1, 1, 1), (3, 1, 3), (9, 2, 5)])
+def test_views_of_many_ccd_lines_stand_in_rows_and_columns(notes, lines, residuals, images):
+    """Residuals of nine lay one upon the other, 50 points high, and left the curves a hundred; image lines of nine
+    were 76 points wide, with three letters of their names."""
+    names = {f"L{k}": f"Residuals L{k}" for k in range(lines)}
+    layout = replace(notes.layouts[-1], ccds=names, image_size=(12000.0, 1920.0), lines_size=(400.0, 1240.0))
+    side, plots = _overview(layout).contents[1].contents
+    assert (side.grid_columns, len(side.contents)) == (residuals, lines) and len(plots.contents) == 4
+    lines_shown = _overview(replace(layout, lines=tuple(names))).contents[1].contents[0]
+    assert (lines_shown.grid_columns, len(lines_shown.contents)) == (images, lines)
+
+
 def test_a_scene_without_configuration_draws_what_it_can(messages):
     canvas = Notebook()
     counts = show([m for m in messages if not m.topic.startswith(("configuration/", "observation/"))], canvas)
@@ -425,6 +438,33 @@ def test_the_window_is_shown_on_the_ground_and_the_light_beside_it(messages):
     assert lengths[0] > lengths[1] > 300.0
     assert len(canvas.drawn["points/fresh"][0]) > 20
     assert canvas.curves["plots/integrity/position/X_protection"][1][-1] == 1.0
+
+
+def test_a_strip_without_rays_up_to_its_end_is_whole_when_it_is_over(messages):
+    """It stayed "live window" where the last ray was more than a second before its end, or where there was none."""
+    reports = [m for m in messages if m.topic == "adjustment/report"]
+    last, body = reports[-1], type(reports[-1].body)()
+    body.update, body.window_start_ns = 99, last.stamp_ns + 5 * convert.SECOND_NS
+    over = Message(last.topic, body.window_start_ns, body, last.source, last.sequence + 1)
+    canvas = Notebook()
+    show([*(m for m in messages if m.topic != last.topic), over], canvas)
+    assert canvas.drawn["flight/window/marginal/name"][2] == ["whole strip"]
+    assert not canvas.drawn["flight/window/live"][0]
+
+
+def test_looks_have_their_names_where_others_do_not_meet_the_ground():
+    """In a steep turn or climb some look above the horizon: all after them had the name of another."""
+    state, canvas = SceneState(), Notebook()
+    state.camera = preset("ads40")
+    part = FlightPart(state)
+    for pitch_deg, seen in ((0.0, "FNB"), (70.0, "NB"), (-80.0, "FN"), (180.0, "")):
+        half = np.radians(pitch_deg) / 2
+        quaternion = np.array([0.0, -np.sin(half), 0.0, np.cos(half)])  # about the axis to the left: the nose goes up
+        sample = PoseSample(START_NS, np.array([0.0, 0.0, 1500.0]), quaternion, None, True)
+        state.newest = sample
+        part.pose("trajectory", sample)
+        part.draw(canvas)
+        assert "".join(canvas.names["flight/looks"]) == seen, pitch_deg
 
 
 def test_in_another_local_frame_nothing_of_the_one_before_stays_drawn(messages):
