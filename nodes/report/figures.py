@@ -205,6 +205,7 @@ def _vectors(ax: Axes, ccd: str, rows: Array, color: str, rms: float, longest: f
 
 def _histogram(ax: Axes, rows: Array, rms: float, first: bool) -> None:
     if not len(rows):
+        ax.set_axis_off()
         return
     edges = np.linspace(-4 * rms, 4 * rms, 33)
     middle = np.linspace(-4 * rms, 4 * rms, 200)

@@ -85,9 +85,8 @@ def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
     for key, text in (("points", points), ("orientation", "orientation (on-line, final)")):
         if all(better.get(key) or [None]):
             low, high = min(better[key]), max(better[key])
-            tiles.append(
-                (f"{low:.1f}–{high:.1f} ×", f"better {text} than direct georeferencing", "good" if low > 1 else "bad")
-            )
+            times = "–".join(dict.fromkeys((f"{low:.1f}", f"{high:.1f}")))
+            tiles.append((f"{times} ×", f"better {text} than direct georeferencing", "good" if low > 1 else "bad"))
     tiles.append((f"{recording['tie_points']}", f"object points in {recording['rays']} rays", ""))
     tiles.append((f"{recording['control_points']} / {recording['check_points']}", "control / check points", ""))
     if "latency_s" in result:

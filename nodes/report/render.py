@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from .style import svg
 
 _DPI = 160
+_MOST_CHARACTERS = 80  # of the columns of a table of statistics in letters of usual size
 
 
 def render(template: str, **values: Any) -> str:
@@ -27,13 +28,23 @@ def render(template: str, **values: Any) -> str:
 
 
 def number(value: float | None, digits: int) -> str | None:
-    """A number with so many digits behind the point."""
-    return None if value is None else f"{value:.{digits}f}"
+    """A number with so many digits behind the point, and no minus before zeros."""
+    return None if value is None else f"{value:z.{digits}f}"
 
 
 def mdeg(degrees: float | None, digits: int) -> str | None:
     """An angle in thousandths of a degree."""
     return None if degrees is None else number(1000.0 * degrees, digits)
+
+
+def needs_room(rows: dict[str, Any], groups: list[tuple[str, str, int]]) -> bool:
+    """Whether a table of statistics (see `accuracy` of parts.html) is wider than the page in letters of usual size."""
+    wanted = 0
+    for _, key, digits in groups:
+        write = mdeg if key.endswith("_deg") else number
+        told = [row[key] for row in rows.values() if key in row]
+        wanted += sum(max((len(write(values[i], digits) or "") for values in told), default=1) for i in range(3))
+    return wanted > _MOST_CHARACTERS
 
 
 def four_figures(value: float, factor: float = 1.0) -> str:
@@ -67,4 +78,4 @@ _PAGES = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_PAGES.filters |= {"number": number, "mdeg": mdeg, "four_figures": four_figures}
+_PAGES.filters |= {"number": number, "mdeg": mdeg, "four_figures": four_figures, "needs_room": needs_room}

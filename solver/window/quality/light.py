@@ -271,6 +271,7 @@ class StripRecord:
     weak_for : looks, by reason without its figures
     words : of these reasons
     free : most tie points that the window had, None: not known
+    seen : most points with a ray that it had
     """
 
     final: int = 0
@@ -286,11 +287,13 @@ class StripRecord:
     weak_for: Counter[str] = field(default_factory=Counter[str])
     words: dict[str, str] = field(default_factory=dict)
     free: int | None = None
+    seen: int = 0
 
     def look(self, s: QualityFindings, colour: str, reason: str) -> None:
         """Remember what the light said in flight."""
         self.looks[colour] += 1
         self.last = s
+        self.seen = max(self.seen, s.points - s.refused)
         self.doubted += max(s.trajectory) > DOUBTED
         a, b, c = np.maximum(self.trajectory, s.trajectory).tolist()
         self.trajectory = a, b, c
@@ -327,6 +330,8 @@ class StripRecord:
             return FAILED, f"{over}: {self.failure} (for {100 * failed:.0f} % of its time)"
         if doubt is not None:
             return doubt[0], f"{over}: {doubt[1]}"
+        if last is not None and not self.seen:
+            return WEAK, f"{over}: no tie points: the orientation is the measured one"
         if self.on_gnss:
             return WEAK, f"{over}: {self.on_gnss}"
         if self.free == 0:

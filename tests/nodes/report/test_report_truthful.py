@@ -23,6 +23,7 @@ from triline.nodes.report.evaluation import evaluate, evaluate_flight, missing
 from triline.nodes.report.figures import progress, residuals, residuals_by_ccd, trajectory_map
 from triline.nodes.report.flight import collect
 from triline.nodes.report.page import page
+from triline.nodes.report.render import needs_room, number
 from triline.nodes.report.source import read
 from triline.nodes.report.style import styled
 from triline.nodes.report.tracks import tracks
@@ -105,6 +106,26 @@ def test_an_old_report_stays_when_the_new_one_fails(tmp_path, capsys):
 
 
 # ---- one kind of figure
+
+
+@pytest.mark.parametrize(("metres", "small"), [(0.05, False), (99.9, False), (1429.5, True)])
+def test_a_table_of_large_figures_is_set_small(metres, small):
+    """Of MISR, its last columns were out of sight, and on paper cut."""
+    groups = [(key, key, 3) for key in ("rmse_m", "mean_m", "max_m", "sigma_m")]
+    rows = {"final": {key: [-0.01, metres / 9, -metres] for _, key, _ in groups}, "measured": {"rmse_m": [0.0] * 3}}
+    assert needs_room(rows, groups) is small
+    assert number(-0.0004, 3) == "0.000" and number(-0.0006, 3) == "-0.001"
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_equal_figures_are_told_once_and_a_ccd_line_without_residuals_has_no_axes(messages, tmp_path):
+    """Of a flight that nothing ties the page had "1.0–1.0 ×", and an empty histogram from 0 to 1."""
+    path = write_recording(tmp_path / "flight.mcap", [x for x in messages if x.topic != "point/object"])
+    flight, held = read(path)
+    result = analyse(flight, held) | {"improvement": {"orientation": [1.01, 1.02, 1.04]}}
+    assert "<b>1.0 ×</b>" in page(flight, result)
+    flight.rejected = [m.RejectedObservation(point="T1", strip="S1", ccd="N", line=5.0, sample=7.0, w=9.0)]
+    assert [ax.axison for ax in residuals(flight).axes] == [True, False]
 
 
 @pytest.mark.usefixtures("undrawn")

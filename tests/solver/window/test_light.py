@@ -269,6 +269,11 @@ def test_before_the_first_strip_there_is_nothing_to_say():
             [replace(FINE, control=np.zeros(3), exposure=replace(CALM, sigma=np.full(6, 0.9)))] * 20, 0.5,
             WEAK, "strip S1 over: no control within 25 s; position and height datum rest on GNSS",
         ),
+        # of a strip that nothing ties, as of a camera with one CCD line, control is not what is missing
+        (
+            [replace(FINE, control=np.zeros(3), exposure=None, points=3, refused=3, tied=0)] * 20, 2.0,
+            WEAK, "strip S1 over: no tie points: the orientation is the measured one",
+        ),
     ],
 )  # fmt: skip
 def test_the_verdict_on_a_strip_stays_until_the_next_begins(situations, protection, colour, words):
