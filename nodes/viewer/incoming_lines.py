@@ -33,7 +33,7 @@ class LinesPart(Part):
 
     def __init__(self, state: SceneState) -> None:
         super().__init__(state)
-        self._strip = ""
+        self._strip: dict[str, str] = {}  # of each CCD line: cameras that look at once make a strip each
         self._tiles: dict[str, _Tiles] = {}
         self._marks: dict[str, deque[tuple[float, float, Color]]] = {}
         self._targets: dict[str, dict[str, tuple[float, float, Color, str]]] = {}
@@ -47,7 +47,7 @@ class LinesPart(Part):
         elif topic == "observation/tie":
             color = _color(body.point)
             for image in body.images if len(body.images) > 1 else ():
-                if image.strip == self._strip and image.ccd in self._marks:
+                if image.strip == self._strip.get(image.ccd):
                     self._marks[image.ccd].append((image.line, image.sample, color))
                     self._changed = True
         elif topic == "observation/target":
@@ -58,11 +58,11 @@ class LinesPart(Part):
     def _take_lines(self, ccd: str, block: Any) -> None:
         if ccd not in self.state.ccds:
             return
-        if block.strip != self._strip:
-            self._strip = block.strip
-            self._tiles = {ccd: _Tiles(self.state.lines_reduced) for ccd in self.state.ccds}
-            self._marks = {ccd: deque(maxlen=_MARKED) for ccd in self.state.ccds}
-            self._targets = {ccd: {} for ccd in self.state.ccds}
+        if block.strip != self._strip.get(ccd):
+            self._strip[ccd] = block.strip
+            self._tiles[ccd] = _Tiles(self.state.lines_reduced)
+            self._marks[ccd] = deque(maxlen=_MARKED)
+            self._targets[ccd] = {}
             self.state.has_lines = True
         strip = self.state.strips.get(block.strip)
         rate = strip.line_rate_hz if strip is not None and strip.line_rate_hz > 0 else 100.0
@@ -70,7 +70,7 @@ class LinesPart(Part):
 
     def _take_target(self, body: Any) -> None:
         image = body.image
-        if image.strip != self._strip or image.ccd not in self._targets or body.state == body.NOT_FOUND:
+        if image.strip != self._strip.get(image.ccd) or body.state == body.NOT_FOUND:
             return
         doubtful = body.state in (body.HELD, body.REJECTED)
         color = REJECTED if doubtful else CHECK if body.point in self._check else CONTROL

@@ -16,10 +16,13 @@ from triline.nodes import convert
 from triline.nodes.cli.view import show
 from triline.nodes.convert import PoseSample
 from triline.nodes.node import Message
+from triline.nodes.viewer.incoming_lines import LinesPart
 from triline.nodes.viewer.rerun_canvas import _ASPECT, _FIELD_OF_VIEW, _overview, viewpoint
 from triline.nodes.viewer.scene_part import CHECK, CONTROL, FINAL, LIVE, REJECTED, Pieces
 from triline.nodes.viewer.scene_state import PoseHistory, SceneState, round_number
 from triline.nodes.viewer.trajectories import FlightPart, ellipsoid
+from triline.schemas.image_lines import LineBlock
+from triline.schemas.messages import ImagePoint, TiePoint
 from triline.solver.camera.sensors import preset
 from triline.solver.geometry.rotation import matrix_from_quaternion
 
@@ -450,6 +453,28 @@ def test_a_strip_without_rays_up_to_its_end_is_whole_when_it_is_over(messages):
     show([*(m for m in messages if m.topic != last.topic), over], canvas)
     assert canvas.drawn["flight/window/marginal/name"][2] == ["whole strip"]
     assert not canvas.drawn["flight/window/live"][0]
+
+
+def test_image_lines_of_cameras_that_look_at_once_are_shown_together():
+    """Each makes a strip of its own: every block had wiped those of the other, and all views stayed empty."""
+    state, canvas = SceneState(), Notebook()
+    state.camera = preset("ads40-small")
+    part = LinesPart(state)
+    pixels = np.tile(np.arange(state.camera.lines[0].pixels, dtype=np.uint16), (50, 1))
+    looks = {"F": "S1", "N": "S2"}
+    for k in range(4):  # half a second of lines
+        for ccd, strip in looks.items():
+            block = LineBlock(pixels, ccd, strip, 50 * k, START_NS)
+            part.take(Message(f"sensor/lines/{ccd}", START_NS, block))
+    images = [ImagePoint(ccd=ccd, strip=strip, line=20.0, sample=99.0) for ccd, strip in looks.items()]
+    images.append(ImagePoint(ccd="N", strip="S1", line=30.0, sample=99.0))  # not in the strip that is shown
+    part.take(Message("observation/tie", START_NS, TiePoint(point="T1", images=images)))
+    part.draw(canvas)
+    for ccd in looks:
+        assert f"lines/{ccd}/strip/tile/0" in canvas.drawn and len(canvas.drawn[f"lines/{ccd}/strip/ties"][0]) == 1
+    part.take(Message("sensor/lines/N", START_NS, LineBlock(pixels, "N", "S3", 0, START_NS)))  # begins anew
+    part.draw(canvas)
+    assert canvas.drawn["lines/N/strip"][0] == (0.0, 0.0) and canvas.drawn["lines/F/strip"][0][1] > 0.0
 
 
 def test_looks_have_their_names_where_others_do_not_meet_the_ground():
