@@ -183,7 +183,7 @@ class Fly(LiveFlight):
             one = "runs" if len(there) == 1 else "run"
             raise UserError(
                 f"platform {self.platform!r} flies already: {', '.join(sorted(there))} {one} on port {port}, "
-                "wanted them stopped, or another --port"
+                f"wanted them stopped, another flight.platform in {FILE}, or another --port"
             )
 
     def clear(self) -> None:

@@ -24,6 +24,8 @@ _HEAD = f"{'n':>6}       X       Y       Z  "
 #: How the lines begin that say in ``missing`` of an evaluation that nothing was measured in images, and that there is
 #: nothing to compare object points with.
 NO_TIES, NO_TRUTH, NO_CHECK = "observation/tie", "truth/point", "check points"
+#: What is said of check points that are no object points.
+NONE_MEASURED = "none of them is measured in an image"
 _NOTE = "sigma: root mean of the stated variances; NEES: squared errors over stated variances, 1 expected"
 
 
@@ -69,6 +71,8 @@ def _conclusion(result: dict[str, Any], points: dict[str, Any]) -> list[str]:
         lacks = {name for name in (NO_TIES, NO_TRUTH, NO_CHECK) for line in result["missing"] if line.startswith(name)}
         if NO_TIES in lacks:
             why = "there is no tie point in it"
+        elif f"{NO_CHECK}: {NONE_MEASURED}" in result["missing"]:
+            why = "no check point is measured in an image, and tie points have no truth"
         elif {NO_TRUTH, NO_CHECK} <= lacks:
             why = "there is no check point in it, and no truth of the tie points"
         lines.append(f"  none: {why}")

@@ -17,7 +17,7 @@ from ...solver.geometry.rotation import matrix_from_navigation, quaternion_from_
 from ...solver.geometry.space_intersection import ImageRays, Intersection, intersect
 from ...solver.geometry.trajectory import Trajectory
 from .. import convert
-from .accuracy_table import NO_CHECK, NO_TIES, NO_TRUTH
+from .accuracy_table import NO_CHECK, NO_TIES, NO_TRUTH, NONE_MEASURED
 from .flight import Flight, Look, PoseSeries, collect, in_gap, rejected_key
 
 Array = NDArray[np.floating]
@@ -148,6 +148,7 @@ def _totals(flight: Flight) -> dict[str, Any]:
 def missing(flight: Flight) -> list[str]:
     """Topics that a full evaluation needs and the recording does not hold, a line each."""
     why = "the adjuster gave none" if flight.reports else "the recording has not been through the adjuster"
+    check = set(_given(flight, "check"))
     wanted = [
         (flight.project is not None, "configuration/project"),
         (flight.camera is not None, "configuration/camera: no object points by direct georeferencing"),
@@ -158,7 +159,8 @@ def missing(flight: Flight) -> list[str]:
         (bool(flight.truth_points), f"{NO_TRUTH}: no error of the object points"),
         (bool(flight.reports), "adjustment/report"),
         (bool(flight.points), "point/object"),
-        (bool(_given(flight, "check")), f"{NO_CHECK} (observation/control with role check)"),
+        (bool(check), f"{NO_CHECK} (observation/control with role check)"),
+        (not check or not flight.points or bool(check & set(flight.points)), f"{NO_CHECK}: {NONE_MEASURED}"),
     ]
     gaps = flight.poses["truth"].gaps() if "truth" in flight.poses else []
     spans = [span for span in map(flight.strip_times, flight.strips) if span is not None]

@@ -87,6 +87,19 @@ def test_a_flight_without_a_tie_point_says_so(messages, dropped, why):
     assert bool(dropped) == any(line == "observation/tie: no object points" for line in result["missing"])
 
 
+def test_check_points_that_are_not_measured_are_told(messages):
+    """Of hundreds of points that were adjusted the table said that none got two looks."""
+    check = {x.body.point for x in messages if x.topic == "observation/control" and x.body.role == x.body.CHECK}
+    measured = [x for x in messages if not (x.topic.startswith("point/") and x.body.point in check)]
+    result = evaluate_flight(collect([x for x in measured if x.topic != "configuration/camera"]))
+    assert "check points: none of them is measured in an image" in result["missing"]
+    result |= {"points": {}, "check": {}}
+    for missing_too in ([], ["truth/point: no error of the object points"]):
+        told = accuracy_lines(result | {"missing": [*result["missing"], *missing_too]})
+        assert [line for line in told if line.startswith("  none: no check point is measured in an image")]
+    assert not any(line.startswith("check points") for line in evaluate_flight(collect(messages))["missing"])
+
+
 def test_a_place_that_cannot_be_written_is_refused_before_the_work(recording, tmp_path, capsys, monkeypatch):
     worked = []
     monkeypatch.setattr("triline.nodes.report.source.read", lambda path: worked.append(path))
