@@ -171,7 +171,10 @@ def test_a_platform_that_flies_already_is_not_flown_again(folder, capsys, monkey
     with Bus("live1", source="adjuster", port=port) as bus:
         bus.announce("adjuster")
         assert main(words) == 1
-    told = f"platform 'live1' flies already: adjuster runs on port {port}, wanted them stopped, or another --port"
+    told = (
+        f"platform 'live1' flies already: adjuster runs on port {port}, wanted them stopped, "
+        "another flight.platform in flight.toml, or another --port"
+    )
     assert capsys.readouterr().err == f"triline fly: {told}\n"
 
 
