@@ -23,6 +23,7 @@ LOOPBACK = "127.0.0.1"
 _FIRST_PORTS = {"grpc": 9876, "web": 9090}
 _START_TIMEOUT_S = 20.0
 _CLOSED = (0, -signal.SIGTERM, -signal.SIGINT)
+_KILLED = -9
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
@@ -102,7 +103,12 @@ class ViewerProcess:
         UserError : it ended because it could not go on
         """
         if self.process.poll() not in (None, *_CLOSED):
-            raise UserError(f"the viewer ended: {self._last_line()}; triline view: --web and --rrd FILE go without it")
+            raise UserError(f"the viewer ended: {self._why()}; triline view: --web and --rrd FILE go without it")
+
+    def _why(self) -> str:
+        if self.process.returncode == _KILLED:  # its last line tells of something else
+            return "it was killed, as by the system where memory runs out"
+        return self._last_line()
 
     def _last_line(self) -> str:
         lines = self._log.read_text(errors="replace").strip().splitlines() if self._log.exists() else []

@@ -347,6 +347,14 @@ def test_a_viewer_that_cannot_go_on_says_why(tmp_path):
         viewer.wait()
 
 
+def test_a_viewer_that_was_killed_says_so(tmp_path):
+    """It gave the last line of the log, whatever that was, as the reason."""
+    viewer = _ended(tmp_path, None)
+    viewer.process.kill()
+    with pytest.raises(UserError, match=r"^the viewer ended: it was killed, as by the system where memory runs out; "):
+        viewer.wait()
+
+
 def test_view_command_writes_a_file(recording, messages, tmp_path, capsys):
     target = tmp_path / "view.rrd"
     assert main(["view", str(recording), "--rrd", str(target), "--json"]) == 0
