@@ -21,6 +21,9 @@ Array = NDArray[np.floating]
 #: Image points drawn at most in a frame; arrows of more would cover each other.
 MOST_ARROWS = 150
 
+#: Frames side by side at most.
+MOST_COLUMNS = 4
+
 #: Of curves in the same colour.
 _STYLES: Any = ("-", (0, (5, 1.5)), (0, (1.2, 1)), (0, (5, 1, 1, 1)))
 _BLUE, _RED, _GREY, _GREEN = "#2b5d8a", "#c0392b", "#9aa5b1", "#3a7d44"
@@ -42,19 +45,22 @@ def write_plots(adjustment: Adjustment, folder: Path) -> list[Path]:
 
 
 def draw_residuals(adjustment: Adjustment) -> Any:
-    """Residual vectors of every CCD line over the strip, in pixels; rejected image points are crosses."""
+    """Residual vectors of every CCD line over the strip, in pixels; rejected image points are crosses. A strip begins a
+    row, and has as many as its CCD lines need."""
     result = adjustment.result
     network, rays, s = result.network, result.network.rays, result.rays
     out = np.zeros(len(rays), dtype=bool)
     out[[r.ray for r in result.rejected if r.ray >= 0]] = True
-    lines = [k for k in range(len(network.camera.lines)) if (rays.ccd == k).any()]
-    strips = [i for i in range(len(network.strips)) if (rays.strip == i).any()]
-    height = 0.9 + 1.9 * len(strips)
-    figure, axes = plt.subplots(
-        len(strips), len(lines), figsize=(1.5 + 4.2 * len(lines), height), squeeze=False, sharex="row"
-    )
+    ccds = [np.unique(rays.ccd[rays.strip == i]) for i in range(len(network.strips))]
+    most = max(map(len, ccds))
+    columns = -(-most // -(-most // MOST_COLUMNS))
+    panels = [(i, seen[k : k + columns]) for i, seen in enumerate(ccds) for k in range(0, len(seen), columns)]
+    height = 0.9 + 1.9 * len(panels)
+    figure, axes = plt.subplots(len(panels), columns, figsize=(1.5 + 4.2 * columns, height), squeeze=False)
     rms = float(np.sqrt(np.mean(s.v_px[~out] ** 2))) or 1.0
-    for a, i in enumerate(strips):
+    for a, (i, lines) in enumerate(panels):
+        for axis in axes[a, len(lines) :]:
+            axis.set_axis_off()
         first, reach = float(rays.line[rays.strip == i].min()), float(np.ptp(rays.line[rays.strip == i])) or 1.0
         for b, k in enumerate(lines):
             axis = axes[a, b]
@@ -77,14 +83,14 @@ def draw_residuals(adjustment: Adjustment) -> Any:
             name = f"strip {network.strips[i].id}, {network.camera.lines[k].id}"
             thinned = f"; 1 in {every} of {len(used)}" if every > 1 else f"; {len(used)}"
             axis.set_title(f"{name}: rms {rms_here[0]:.2f}, {rms_here[1]:.2f} px{thinned}", fontsize=9)
-            if a == len(strips) - 1:
+            if a == len(panels) - 1 or b >= len(panels[a + 1][1]):
                 axis.set_xlabel("line")
             if b == 0:
                 axis.set_ylabel("sample")
     figure.suptitle(
         f"Residuals of line and sample; an arrow of 1/25 of a frame is {rms:.2f} px; {int(out.sum())} rejected (x)",
-        y=1.0 - 0.06 / height,
-    )
+        y=1.0 - 0.06 / height, fontsize="large" if columns > 1 else "small",
+    )  # fmt: skip
     figure.tight_layout()
     return figure
 

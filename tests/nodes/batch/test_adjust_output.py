@@ -97,7 +97,7 @@ def test_a_full_disk_leaves_the_result_of_the_earlier_run(folder, tmp_path, caps
         assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == old
 
 
-def test_residuals_are_thinned_and_say_so(tmp_path):
+def test_residuals_are_thinned_and_say_so(tmp_path, monkeypatch):
     write_block(tmp_path / "block", points=500)
     block = read_input(tmp_path / "block")
     adjustment = adjust_block(block, Job(MODELS["dgr"].from_settings({})))
@@ -108,6 +108,13 @@ def test_residuals_are_thinned_and_say_so(tmp_path):
         total = int(axis.get_title().rsplit(" of ", 1)[1])
         every = int(axis.get_title().rsplit("1 in ", 1)[1].split()[0])
         assert 75 < np.size(quiver.U) == -(-total // every) <= adjustment_plots.MOST_ARROWS and every > 1
+    monkeypatch.setattr(adjustment_plots, "MOST_COLUMNS", 2)  # of nine CCD lines the picture was 4 300 pixels wide
+    shown = [axis.axison for axis in adjustment_plots.draw_residuals(adjustment).axes]
+    assert shown == [True, True, True, False] * len(block.strips)
+    rays = adjustment.result.network.rays
+    rays.ccd[:] = rays.strip % 3  # as of scenes: 72 of 81 frames of MISR were empty, with "rms nan, nan px"
+    scenes = adjustment_plots.draw_residuals(adjustment).axes
+    assert len(scenes) == len(block.strips) and not any("nan" in axis.get_title() for axis in scenes)
 
 
 @pytest.mark.parametrize("name", ["S", "strip_over_the_valley_of_the_north_"])
