@@ -145,7 +145,10 @@ def _sources(flight: Flight, lit: list[tuple[int, Any]], lasting: list[float]) -
 
 
 def protection_figure(flight: Flight) -> Figure | None:
-    """Protection level and sigma of the newest orientation, its error where there is truth; the light as background."""
+    """Protection level and sigma of the newest orientation, its error where there is truth; the light as background.
+
+    None where no report on a strip has them, as where strips are matched when they are over.
+    """
     found = levels(flight)
     if found is None:
         return None
@@ -165,6 +168,8 @@ def protection_figure(flight: Flight) -> Figure | None:
             ax.plot(x, y[:, 0], color=color, lw=width, label=name)
             lone = _lone(y[:, 0])
             ax.plot(x[lone], y[lone, 0], color=color, ls="", marker=".", ms=3.0 + 2.0 * width)
+        if not drawn["protection level"].size:
+            return None
         ax.set_yscale("log")
         low = float(drawn["σ"].min(initial=np.inf))
         high = float(drawn["protection level"].max(initial=0.0))

@@ -151,6 +151,12 @@ def test_a_report_between_strips_does_not_set_the_scale_of_the_levels(messages):
     assert before is not None and after is not None
     for a, b in zip(before.axes, after.axes, strict=True):
         assert a.get_ylim() == pytest.approx(b.get_ylim())
+    # where all of them come between strips there is no figure: it was empty, with an axis of 2e-10 m
+    stamp, lit = next((stamp, r) for stamp, r in flight.reports if r.light and r.strip)
+    bare = copy.deepcopy(lit)
+    del bare.protection[:]
+    flight.reports = [(stamp, bare), flight.reports[-1]]
+    assert levels(flight) is not None and protection_figure(flight) is None
 
 
 def test_the_page_has_a_section_with_figure_and_units(messages, tmp_path, request):
