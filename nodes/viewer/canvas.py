@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating]
 Color = tuple[int, int, int, int]
 
+#: Between which sigma0 is drawn as long as it stays there.
+SIGMA0_SPAN = 0.7, 1.3
+
 
 @dataclass(frozen=True)
 class Series:
@@ -36,6 +39,7 @@ class ViewLayout:
     image_size : width (samples) and height of an image-space view
     units : units of the parameters, one plot each
     strip_s : length of the longest strip, about
+    sigma0 : between which sigma0 is drawn
     window_s : length of the adjustment's window: so far back what is not final yet is shown in plots; None: all of it
     adjusted : whether there is a camera, or anything of the adjuster; else there is nothing but a trajectory
     truth : whether errors against truth are shown
@@ -52,6 +56,7 @@ class ViewLayout:
     image_size: tuple[float, float]
     units: tuple[str, ...] = ()
     strip_s: float = 60.0
+    sigma0: tuple[float, float] = SIGMA0_SPAN
     window_s: float | None = None
     adjusted: bool = True
     truth: bool = False

@@ -28,6 +28,7 @@ _STEP_NS = int(0.2 * convert.SECOND_NS)
 _ALPHA = 0.05
 _WAITING = 1000
 _GAP_S, _UPDATES, _RAYS_GAP_S = 1.5, 3.0, 6.0  # a curve is broken after so long without a pose, so many updates, rays
+_MOST_LIMITS = 10.0  # in the overview protection levels end at so many alert limits
 _TELLING = 30  # redundancy from which sigma0 says something
 _RECORD = faded(LIVE, 0.45)
 _GREY = (140, 140, 150, 255)
@@ -133,6 +134,7 @@ class PlotsPart(Part):
         self._add("sigma0/one", t, 1.0, Series("1.0", TRUTH, 1.0), gap_s)
         if report.redundancy >= _TELLING:
             self._add("sigma0/value", t, report.sigma0, Series("sigma0", FINAL, 2.0), gap_s)
+            self.state.note_sigma0(report.sigma0)
             low, high = _sigma0_band(int(report.redundancy))
             self._add("sigma0/low", t, low, Series("95 %, low", _GREY, 1.0), gap_s)
             self._add("sigma0/high", t, high, Series("95 %, high", _GREY, 1.0), gap_s)
@@ -163,12 +165,13 @@ class PlotsPart(Part):
                     name = COMPONENTS[part][axis].removeprefix("d")
                     series = Series(f"{name}, {kind}", AXES[axis] if width > 1 else faded(AXES[axis], 0.7), width)
                     self._add(f"integrity/{group}/{name}_{kind}", t, scale * value, series, gap_s)
+        most = _MOST_LIMITS * report.alert_limit_m or np.inf  # of a young window they are hundreds of kilometres
         for kind, values, color in (("protection", report.protection, LIVE), ("sigma", report.sigma, CHECK)):
             if len(values) == 6:
-                self._add(f"overview/integrity/{kind}", t, max(values[:3]), Series(kind, color, 2.0), gap_s)
+                self._add(f"overview/integrity/{kind}", t, min(max(values[:3]), most), Series(kind, color, 2.0), gap_s)
         if report.alert_limit_m > 0 and report.ground_protection:
             ground = Series("protection on the ground", FINAL, 2.0)
-            self._add("overview/integrity/ground", t, max(report.ground_protection), ground, gap_s)
+            self._add("overview/integrity/ground", t, min(max(report.ground_protection), most), ground, gap_s)
             limit = Series("alert limit", CONTROL, 1.0)
             self._add("overview/integrity/limit", t, report.alert_limit_m, limit, gap_s)
 

@@ -278,7 +278,7 @@ def _overview(layout: ViewLayout) -> rrb.Container:
     )
     back = _back_s(layout)
     curves = rrb.Grid(
-        _plot("sigma0", "sigma0 and its 95 % band", (0.7, 1.3), legend=False),
+        _plot("sigma0", "sigma0 and its 95 % band", layout.sigma0, legend=False),
         _plot("latency", "Latency [ms]"),
         _plot(
             "overview/position",

@@ -204,6 +204,7 @@ class Scene:
             s.bar_px,
             s.window_s,
             s.strip_s,
+            s.sigma0_span,
         )
         if key == self._laid_out or (not s.extent and s.framed is None):
             return
@@ -229,6 +230,7 @@ class Scene:
             image_size=s.image_size,
             units=tuple(s.units),
             strip_s=s.strip_s,
+            sigma0=s.sigma0_span,
             window_s=s.window_s,
             adjusted=adjusted,
             truth=s.has_truth,
@@ -257,7 +259,7 @@ class Scene:
             "three sigma, what was said at once of the time that the window holds; thin, what was said at once of "
             "earlier times.\n\n"
             "Protection level: with a risk of 0.001 the orientation is not further off, even if one gross error that "
-            "the tests do not find is among the observations.",
+            "the tests do not find is among the observations. The overview draws none beyond ten alert limits.",
         )
 
     def _along(self) -> Array:

@@ -15,6 +15,7 @@ from ...solver.geometry.rotation import matrix_from_quaternion
 from .. import convert
 from ..convert import PoseSample
 from ..node import Message
+from .canvas import SIGMA0_SPAN
 
 Array = NDArray[np.floating]
 _HISTORY_S = 120.0
@@ -24,6 +25,7 @@ _IMAGE_HEIGHT = 0.16  # of an image-space view, as a share of its width
 _LINES_WIDTH, _LINES_HIGH = 400, 2.4  # of a view of image lines, about, px; and its height at least, in widths
 _NO_LENGTH_S = 60.0  # of a strip whose end is not known
 _WINDOW_CHANGE = 0.2  # of its length, at least: views are arranged again
+_SIGMA0_ROOM, _SIGMA0_MOST = 1.3, 4.0
 _SWING = 3.3  # standard deviations that a slow error reaches in a flight, about
 _ROOM = 0.2  # of the flying height: what deviations of that size are drawn as
 
@@ -79,6 +81,7 @@ class SceneState:
     measured : the trajectory others are compared with, "filtered" or "smoothed"
     trajectory, truth : the newest poses of both
     units : units of the parameters that have come
+    sigma0_span : between which sigma0 is drawn: about 1, and wider where it was beyond
     window_s : length of the adjustment's window, from where orientation is final until now; None until it is full
     """
 
@@ -98,6 +101,7 @@ class SceneState:
         self.framed: Array | None = None
         self._flown: Array | None = None
         self.units: list[str] = []
+        self.sigma0_span = SIGMA0_SPAN
         self.window_s: float | None = None
         self.has_truth = False
         self.imaged_by: dict[str, set[str]] = {}
@@ -154,6 +158,13 @@ class SceneState:
         length = (stamp_ns - report.window_start_ns) / convert.SECOND_NS
         if self.window_s is None or abs(length - self.window_s) > _WINDOW_CHANGE * self.window_s:
             self.window_s = length
+
+    def note_sigma0(self, value: float) -> None:
+        """Let the plot of sigma0 show a value (of 4 at most), with room: it is arranged anew a few times only."""
+        low, high = self.sigma0_span
+        value = min(value, _SIGMA0_MOST)
+        if not low <= value <= high:
+            self.sigma0_span = min(low, value / _SIGMA0_ROOM), max(high, value * _SIGMA0_ROOM)
 
     def note_pose(self, topic: str, sample: PoseSample) -> None:
         """keep the newest poses; the first one decides the display frame."""

@@ -162,3 +162,24 @@ def test_deviations_as_large_as_the_project_expects_stay_in_view(strip, sigma_m)
     air = corners[corners[:, 2] > 750.0]
     assert np.ptp(air[:, 2]) >= 2 * 3 * factor * sigma_m
     assert 0.08 * 1500 < 3 * factor * sigma_m < 0.4 * 1500  # seen, and not larger than the flight is high
+
+
+def test_what_has_failed_stays_in_view(strip, notes):
+    """A sigma0 beyond 1.3 was drawn outside of its plot, and one level of a young window made all others a line."""
+    told, reports = [], 0
+    for message in strip:
+        if message.topic == "adjustment/report":
+            body = type(message.body)()
+            body.CopyFrom(message.body)
+            body.redundancy, body.sigma0, reports = 300, 2.2, reports + 1
+            if reports == 3:
+                body.sigma0, body.protection[1], body.ground_protection[1] = 90.0, 2e5, 3e5
+            message = Message(message.topic, message.stamp_ns, body, message.source, message.sequence)
+        told.append(message)
+    canvas = Notebook()
+    show(told, canvas)
+    assert notes.layouts[-1].sigma0 == (0.7, 1.3) and canvas.layouts[-1].sigma0 == (0.7, 4.0 * 1.3)
+    for curve, usual in (("protection", 2.0), ("ground", 0.9)):
+        values = np.array(canvas.curves[f"plots/overview/integrity/{curve}"][1])
+        assert (values.min(), values.max()) == (usual, 25.0), curve
+    assert max(canvas.curves["plots/integrity/position/Y_protection"][1]) == 2e5
