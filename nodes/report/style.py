@@ -20,6 +20,7 @@ _RC: dict[str, Any] = {
     "axes.titlesize": 9.5,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
+    "axes.titley": 1.0,  # where it comes anyway: to find that out takes a sixth of the time of a page
     "axes.labelsize": 8.5,
     "axes.spines.top": False,
     "axes.spines.right": False,

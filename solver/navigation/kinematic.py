@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.frames import LocalFrame, R_lc_from_navigation, opk_covariance_from_navigation
-from ..geometry.rotation import angles_from_matrix, quaternion_from_matrix
+from ..geometry.frames import LocalFrame, opk_covariance_from_navigation
+from ..geometry.rotation import angles_from_matrix, matrix_from_navigation, quaternion_from_matrix
 from ..models.gauss_markov import second_order_gauss_markov
 from .kinematic_model import N_STATES, WD, A, KinematicOptions, P, V, W, noise_time, quintic, transition
 from .pose import AttitudeHistory, NavigationEvent, NavigationPose, PoseMaker
@@ -82,6 +82,8 @@ class KinematicFilter:
         self._transitions: dict[int, tuple[Array, Array]] = {}
         self._ahead_cov = np.zeros((len(_AHEAD_S), 3, 3))
         self._ahead_white_m = np.zeros(len(_AHEAD_S))  # without the slow errors
+        self._offset_cov = np.diag(np.square(np.broadcast_to(options.offset_sigma_m, 3)))
+        self._attitude_cov = np.diag(np.square(np.broadcast_to(options.attitude_sigma, 3)))
         self._coasting = False
 
     @cached_property
@@ -92,6 +94,15 @@ class KinematicFilter:
         kf = KalmanFilter(dim_x=N_STATES, dim_z=3)
         kf.x = np.zeros(N_STATES)
         return kf
+
+    @cached_property
+    def _ahead(self) -> list[tuple[Array, Array, Array, Array]]:
+        """What takes the covariance of an epoch to the times after it: of the position, and without the slow errors."""
+        found = []
+        for dt in _AHEAD_S:
+            F, Q = self._transition(float(dt))
+            found.append((F[P], Q[P, P], self._H @ F, self._H @ Q @ self._H.T))
+        return found
 
     # -- input ---------------------------------------------------------------------------------------------------------
 
@@ -293,12 +304,10 @@ class KinematicFilter:
     def _look_ahead(self) -> None:
         """Covariance of the position at a few times after the newest epoch, and the frame at the platform."""
         last = self._epochs[-1]
-        for i, dt in enumerate(_AHEAD_S):
-            F, Q = self._transition(float(dt))
-            self._ahead_cov[i] = F[P] @ last.P @ F[P].T + Q[P, P]
-            HF = self._H @ F
-            self._ahead_white_m[i] = np.sqrt(np.trace(HF @ last.P @ HF.T + self._H @ Q @ self._H.T))
-        self._ahead_cov += np.diag(np.square(np.broadcast_to(self.options.offset_sigma_m, 3)))
+        for i, (F_P, Q_P, HF, HQH) in enumerate(self._ahead):
+            self._ahead_cov[i] = F_P @ last.P @ F_P.T + Q_P
+            self._ahead_white_m[i] = np.sqrt((HF @ last.P @ HF.T + HQH).trace())
+        self._ahead_cov += self._offset_cov
         self._maker.move(last.time_s, last.x[P], last.x[V])
         self._state_scalars = last.x[:9].tolist()
 
@@ -356,13 +365,14 @@ class KinematicFilter:
         position, velocity = quintic(t - times[first:][k], step, x[k], x[k + 1])
         share = ((t - times[first:][k]) / step)[:, None, None]
         position_cov = (1 - share) * cov[k, P, P] + share * cov[k + 1, P, P]
-        position_cov = position_cov + np.diag(np.square(np.broadcast_to(self.options.offset_sigma_m, 3)))
-        R_lc = R_lc_from_navigation(self.frame, position, rpy, self.options.R_bc)
+        position_cov = position_cov + self._offset_cov
+        R_ln = self.frame.R_ln(position)
+        R_lc = R_ln @ matrix_from_navigation(rpy[:, 0], rpy[:, 1], rpy[:, 2]) @ np.asarray(self.options.R_bc)
         angles = angles_from_matrix(R_lc)
         full = np.zeros((len(t), 6, 6))
         full[:, :3, :3] = position_cov
-        full[:, 3:, 3:] = opk_covariance_from_navigation(rpy, R_lc, self.frame.R_ln(position), attitude_cov)
-        full[:, 3:, 3:] += np.diag(np.square(np.broadcast_to(self.options.attitude_sigma, 3)))
+        full[:, 3:, 3:] = opk_covariance_from_navigation(rpy, R_lc, R_ln, attitude_cov)
+        full[:, 3:, 3:] += self._attitude_cov
         white = np.sqrt(np.einsum("kii->k", self._H @ cov @ self._H.T))
         fixes = np.array([e.time_s for e in epochs if e.accepted and e.z is not None])
         near = np.abs(fixes[:, None] - t).min(axis=0) if len(fixes) else np.full(len(t), np.inf)
@@ -387,7 +397,7 @@ class KinematicFilter:
 
     def _noise_time(self, epochs: list[_Epoch]) -> float:
         """Correlation time of the smoothed position where fixes come as in these epochs; 0 if there are too few."""
-        variance = [float(np.trace(e.R)) / 3.0 for e in epochs if e.accepted and e.R is not None]
+        variance = [float(e.R.trace()) / 3.0 for e in epochs if e.accepted and e.R is not None]
         if len(variance) < 2:
             return 0.0
         step_s = (epochs[-1].time_s - epochs[0].time_s) / (len(epochs) - 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass
-from math import asin, atan2, cos, sin
+from math import asin, atan2, cos, inf, sin
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -128,7 +128,7 @@ class PoseMaker:
         self._q_ln: Quaternion = (0.0, 0.0, 0.0, 1.0)
         self._rate = (0.0, 0.0, 0.0)
         self._R_ln = np.eye(3)
-        self._at_rpy = np.full(3, np.inf)
+        self._at_rpy = (inf, inf, inf)
         self._of_cov: Array | None = None
         self._cov_opk: Array = np.zeros((3, 3))
 
@@ -165,11 +165,13 @@ class PoseMaker:
         phi = asin(max(-1.0, min(1.0, 2 * (x * z + y * w))))
         kappa = atan2(-2 * (x * y - z * w), 1 - 2 * (y * y + z * z))
         angles = np.array([omega, phi, kappa])
-        if cov_rpy is not self._of_cov or np.abs(rpy - self._at_rpy).max() > _TURN:
-            if self._of_cov is None or np.abs(rpy - self._at_rpy).max() > _TURN or (cov_rpy != self._of_cov).any():
+        at_roll, at_pitch, at_heading = self._at_rpy
+        turned = max(abs(roll - at_roll), abs(pitch - at_pitch), abs(heading - at_heading)) > _TURN
+        if turned or cov_rpy is not self._of_cov:
+            if turned or self._of_cov is None or (cov_rpy != self._of_cov).any():
                 R_lc = self._R_ln @ matrix_from_navigation(*rpy) @ self.R_bc
                 self._cov_opk = opk_covariance_from_navigation(rpy, R_lc, self._R_ln, cov_rpy) + self._slow
-                self._at_rpy = rpy
+                self._at_rpy = (roll, pitch, heading)
             self._of_cov = cov_rpy
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = position_cov
