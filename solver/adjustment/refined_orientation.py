@@ -42,7 +42,11 @@ def correction_cofactors(solution: Solution, strip: int, time_s: ArrayLike, lens
     design = design_at(solution, found, time_s)
     columns, coefficients = design.columns, design.coefficients
     result = np.zeros((len(columns), 6, 6))
-    _, group = np.unique(columns.reshape(len(columns), -1), axis=0, return_inverse=True)
+    flat = columns.reshape(len(columns), -1)
+    begins = np.ones(len(flat), dtype=bool)  # times that follow each other have the same columns: few rows are sorted
+    begins[1:] = (flat[1:] != flat[:-1]).any(axis=1)
+    _, group = np.unique(flat[begins], axis=0, return_inverse=True)
+    group = group.reshape(-1)[np.cumsum(begins) - 1]
     for g in range(int(group.max(initial=-1)) + 1):
         mine = np.flatnonzero(group == g)
         for some in np.array_split(mine, 1 + len(mine) // AT_ONCE):
