@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
-from .patches import MOST_HOLE, holes_at, interpolate_stack
+from .patches import MOST_HOLE, between, holes_at, interpolate_between
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -149,9 +149,11 @@ class _Window:
     ) -> tuple[Array, Array, Array]:
         """Design (k, p, 8), residuals (k, p) and grey values that were found (k, p)."""
         y, x = self.places(search, shift, affine)
-        found = interpolate_stack(search, y, x).astype(float)
-        gy = interpolate_stack(search, y + 0.5, x).astype(float) - interpolate_stack(search, y - 0.5, x)
-        gx = interpolate_stack(search, y, x + 0.5).astype(float) - interpolate_stack(search, y, x - 0.5)
+        before, rows, after = (between(at, search.shape[1]) for at in (y - 0.5, y, y + 0.5))
+        left, columns, right = (between(at, search.shape[2]) for at in (x - 0.5, x, x + 0.5))
+        found = interpolate_between(search, rows, columns).astype(float)
+        gy = interpolate_between(search, after, columns).astype(float) - interpolate_between(search, before, columns)
+        gx = interpolate_between(search, rows, right).astype(float) - interpolate_between(search, rows, left)
         # gain and offset of the grey values, so that the residual is one of the search image
         gain, offset = _grey_fit(found, wanted, weight)
         residual = (wanted - offset) / gain - found

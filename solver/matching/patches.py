@@ -11,6 +11,8 @@ from scipy.ndimage import maximum_filter, uniform_filter
 Array = NDArray[np.floating]
 Float32 = NDArray[np.floating]
 Mask = NDArray[np.bool_]
+#: The first of the pixels that a value comes from (k, ...), and their weights.
+Between = tuple[NDArray[np.int64], tuple[Float32, ...]]
 
 #: A value counts as measured if no more of it comes from pixels that were not: a bicubic value has less of them.
 MOST_HOLE = 0.1
@@ -115,11 +117,19 @@ def holes_at(holes: Mask, y: Array, x: Array) -> Float32:
 
 def interpolate_stack(stack: Float32, y: Array, x: Array) -> Float32:
     """Bicubic values of patches (k, n, m) at rows and columns (k, ...), each in its own; beyond the border its edge."""
-    n, m = stack.shape[1:]
-    y, x = np.clip(y, 1.0, n - 2.001), np.clip(x, 1.0, m - 2.001)
-    i, j = y.astype(np.int64), x.astype(np.int64)
-    wu, wv = _cubic((y - i).astype(np.float32)), _cubic((x - j).astype(np.float32))
-    return _weighted(stack, i - 1, j - 1, wu, wv)
+    return interpolate_between(stack, between(y, stack.shape[1]), between(x, stack.shape[2]))
+
+
+def between(at: Array, size: int) -> Between:
+    """Where bicubic values at rows or columns (k, ...) come from, of patches with so many of them."""
+    at = np.clip(at, 1.0, size - 2.001)
+    i = at.astype(np.int64)
+    return i - 1, _cubic((at - i).astype(np.float32))
+
+
+def interpolate_between(stack: Float32, rows: Between, columns: Between) -> Float32:
+    """Those of `interpolate_stack`, where several are wanted at the same rows or columns."""
+    return _weighted(stack, rows[0], columns[0], rows[1], columns[1])
 
 
 def _weighted(
@@ -131,9 +141,9 @@ def _weighted(
     at = (np.arange(k) * n * m).reshape((k,) + (1,) * (i.ndim - 1)) + i * m + j
     total = np.zeros(at.shape, dtype=np.float32)
     for a, w in enumerate(wu):
-        row = wv[0] * flat[at + a * m]
+        row = wv[0] * flat[a * m :].take(at)
         for b in range(1, len(wv)):
-            row += wv[b] * flat[at + (a * m + b)]
+            row += wv[b] * flat[a * m + b :].take(at)
         total += w * row
     return total
 
