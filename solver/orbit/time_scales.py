@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from functools import lru_cache
 
 import erfa
 import numpy as np
@@ -76,7 +77,7 @@ def tai_from_day(mjd: int, ns_of_day: int, scale: str = "UTC") -> int:
     """
     ns = (mjd - _UNIX_EPOCH_MJD) * _DAY + ns_of_day
     if scale == "UTC":
-        return ns + round(float(_leap_seconds(np.array([mjd]))[0]) * _SECOND)
+        return ns + _leap_ns(mjd)
     if scale not in _OFFSETS_S:
         raise ValueError(f"time scale {scale!r}, wanted one of {', '.join(SCALES)}")
     return ns + round(_OFFSETS_S[scale] * _SECOND)
@@ -115,6 +116,12 @@ def julian_dates(reference_ns: int, time_s: ArrayLike, scale: str = "TT") -> tup
     day, ns = divmod(int(reference_ns), _DAY)
     seconds = ns / _SECOND + np.asarray(time_s, dtype=float) - _OFFSETS_S[scale]
     return _MJD0 + _UNIX_EPOCH_MJD + day, seconds / 86400.0
+
+
+@lru_cache(maxsize=1024)
+def _leap_ns(mjd_utc: int) -> int:
+    """TAI minus UTC, nanoseconds, at the midnight that begins a day of UTC: the same for all lines of a scene."""
+    return round(float(_leap_seconds(np.array([mjd_utc]))[0]) * _SECOND)
 
 
 def _leap_seconds(mjd_utc: NDArray[np.int64]) -> NDArray[np.floating]:
