@@ -149,6 +149,15 @@ def skew(v: ArrayLike) -> Array:
     return S
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Cross product of (..., 3); several times faster than `numpy.cross` on short arrays."""
+    out = np.empty(a.shape if a.shape == b.shape else np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return out
+
+
 def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
     """Product of scalar-last quaternions, (..., 4): the rotation ``q`` first, then ``p``."""
     p, q = np.asarray(p, dtype=float), np.asarray(q, dtype=float)

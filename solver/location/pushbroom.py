@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..geometry.ellipsoid import WGS84, Ellipsoid
+from ..geometry.rotation import cross
 from ..orbit.line_times import LineTimes
 from ..orbit.motion import FixedPoses, Motion, turned_on
 from .look_directions import LookDirections
@@ -79,7 +80,7 @@ def miss_of(d: Array, rate: Array, look: Array, slope: Array) -> Miss:
     d, rate : (n, 3) directions and their change, a line
     look, slope : (n, 3) look directions of the detectors and their change, a sample
     """
-    across = np.cross(look, slope)
+    across = cross(look, slope)
     square = _dot(look, look)
     along = slope - look * (_dot(look, slope) / square)[:, None]
     depth, depth_rate = _dot(d, look), _dot(rate, look)

@@ -13,6 +13,7 @@ from ..geometry.rotation import (
     R_BC_NOMINAL,
     angles_from_matrix,
     angles_jacobian,
+    cross,
     matrix_from_quaternion,
     navigation_from_matrix,
     quaternion_from_matrix,
@@ -22,7 +23,6 @@ from ..geometry.rotation import (
     vector_from_quaternion,
 )
 from .filter_pass import Carried, Estimates, FilterPass
-from .inertial_data import _cross
 from .smoother import Smoothed
 from .strapdown import OMEGA_IE
 
@@ -184,7 +184,7 @@ class NavigationTrajectory:
         phi, dv = share * c.phi[piece], share * c.dv[piece]
         R0 = matrix_from_quaternion(q0)
         R = matrix_from_quaternion(quaternion_multiply(q0, quaternion_from_vector(phi)))
-        turned = _cross(phi, dv)
+        turned = cross(phi, dv)
         v = row[:, 1:4] + _apply(R0, dv + 0.5 * turned)
         p = row[:, 4:7] + dt[:, None] * (row[:, 1:4] + _apply(R0, dv / 2.0 + turned / 6.0))
         r_e, v_e, R_eb = self._carry(k, row[:, 0] + dt, R, v, p)
@@ -241,11 +241,11 @@ class NavigationTrajectory:
         e = self.nodes
         T, tc = self._duration[k][:, None], t[:, None]
         R_ib, r0 = e.R_eb[k], e.r_e[k]
-        v0 = e.v_e[k] + _cross(OMEGA_IE, r0)
+        v0 = e.v_e[k] + cross(OMEGA_IE, r0)
         g0, dg = self._gamma0[k], (self._gamma1[k] - self._gamma0[k]) / T
         C = _earth_rotations(t)
         r_e = _apply(C, r0 + tc * v0 + _apply(R_ib, p) + tc**2 * (g0 / 2.0 + tc * dg / 6.0))
-        v_e = _apply(C, v0 + _apply(R_ib, v) + tc * (g0 + tc * dg / 2.0)) - _cross(OMEGA_IE, r_e)
+        v_e = _apply(C, v0 + _apply(R_ib, v) + tc * (g0 + tc * dg / 2.0)) - cross(OMEGA_IE, r_e)
         R_eb = C @ R_ib @ R
         if len(self._miss[0]):
             s = tc / T

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..geometry import earth
+from ..geometry.rotation import cross
 
 Array = NDArray[np.floating]
 
@@ -131,17 +132,8 @@ class InertialData:
         else:
             th0[0], v0[0], dt0[0] = np.asarray(previous[0]), np.asarray(previous[1]), previous[2]
         scale = dt / (12.0 * dt0)
-        phi = dtheta + scale * _cross(th0, dtheta)
-        return replace(self, dtheta=phi, dv=dv + scale * (_cross(th0, dv) + _cross(v0, dtheta)))
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Cross product of (..., 3); several times faster than `numpy.cross` on short arrays."""
-    out = np.empty(a.shape if a.shape == b.shape else np.broadcast_shapes(a.shape, b.shape))
-    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
-    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
-    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return out
+        phi = dtheta + scale * cross(th0, dtheta)
+        return replace(self, dtheta=phi, dv=dv + scale * (cross(th0, dv) + cross(v0, dtheta)))
 
 
 def concatenate(parts: list[InertialData]) -> InertialData:

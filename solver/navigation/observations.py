@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry import earth
-from ..geometry.rotation import skew
+from ..geometry.rotation import cross, skew
 from .error_state import ATTITUDE, POSITION, VELOCITY, Estimate, StateLayout
-from .inertial_data import _cross
 from .strapdown import OMEGA_IE
 
 Array = NDArray[np.floating]
@@ -80,7 +79,7 @@ class AntennaVelocity:
             rate = rate / (1.0 + estimate.gyro[3:])
         # the Earth's rotation turns with the platform in the derivative below too, but that is 1e-4 of a lever arm
         turning = rate - s.R_eb.T @ OMEGA_IE
-        swing = s.R_eb @ _cross(turning, arm)
+        swing = s.R_eb @ cross(turning, arm)
         H = np.zeros((3, layout.n))
         H[:, VELOCITY] = np.eye(3)
         H[:, ATTITUDE] = -skew(swing)

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.rotation import matrix_from_quaternion, quaternion_from_vector
+from ..geometry.rotation import cross, matrix_from_quaternion, quaternion_from_vector
 from .error_state import StateLayout
 from .filter_pass import Estimates, FilterPass
-from .inertial_data import _cross
 
 Array = NDArray[np.floating]
 
@@ -63,7 +62,7 @@ def recurse(G: Array, P_posterior: Array, P_prior: Array, x: Array) -> tuple[Arr
     P[-1] = P_posterior[-1]
     for k in range(N - 2, -1, -1):
         e = d[k + 1] + x[k + 1]
-        e[6:9] += 0.5 * _cross(d[k + 1, 6:9], x[k + 1, 6:9])  # one rotation after another, to second order
+        e[6:9] += 0.5 * cross(d[k + 1, 6:9], x[k + 1, 6:9])  # one rotation after another, to second order
         g = G[k]
         d[k] = g @ e
         p = P_posterior[k] + g @ (P[k + 1] - P_prior[k + 1]) @ g.T

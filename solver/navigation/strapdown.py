@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry import earth
-from ..geometry.rotation import matrix_from_quaternion, multiply_plain, quaternion_from_vector, skew
-from .inertial_data import InertialData, _cross
+from ..geometry.rotation import cross, matrix_from_quaternion, multiply_plain, quaternion_from_vector, skew
+from .inertial_data import InertialData
 
 Array = NDArray[np.floating]
 
@@ -190,8 +190,8 @@ def integrate(
     R = np.empty_like(R_end)  # at the start of each piece
     R[:, 0], R[:, 1:] = _EYE, R_end[:, :-1]
     # within a piece rate and force are constant
-    turned = _cross(phi, dv)
-    df = _apply(R, dv + 0.5 * turned + _cross(phi, turned) / 6.0)
+    turned = cross(phi, dv)
+    df = _apply(R, dv + 0.5 * turned + cross(phi, turned) / 6.0)
     dp = _apply(R, dv / 2.0 + turned / 6.0)
     v = np.cumsum(df, axis=1)
     t = dt[..., None]
@@ -329,14 +329,14 @@ def propagate(state: State, duration_s: float, R: Array, v: Array, p: Array) -> 
     T = duration_s
     C = earth_rotation(T)
     r0, R_ib = state.r_e, state.R_eb
-    v0 = state.v_e + _cross(OMEGA_IE, r0)
+    v0 = state.v_e + cross(OMEGA_IE, r0)
     gamma0 = gravitation_e(r0)
     ballistic = r0 + T * v0 + R_ib @ p
     gamma1 = C.T @ gravitation_e(C @ (ballistic + (0.5 * T * T) * gamma0))
     # linear between both ends, less the curvature that the Earth's rotation gives it
-    curvature = _cross(OMEGA_IE, _cross(OMEGA_IE, gamma0))
+    curvature = cross(OMEGA_IE, cross(OMEGA_IE, gamma0))
     r1 = C @ (ballistic + (T * T / 6.0) * (2.0 * gamma0 + gamma1) - (T**4 / 24.0) * curvature)
-    v1 = C @ (v0 + R_ib @ v + (0.5 * T) * (gamma0 + gamma1) - (T**3 / 12.0) * curvature) - _cross(OMEGA_IE, r1)
+    v1 = C @ (v0 + R_ib @ v + (0.5 * T) * (gamma0 + gamma1) - (T**3 / 12.0) * curvature) - cross(OMEGA_IE, r1)
     R1 = C @ R_ib @ R
     R1 = 0.5 * (R1 @ (3.0 * _EYE - R1.T @ R1))  # keeps it a rotation over hours
     return State(r1, v1, R1)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..geometry.earth import ROTATION_RATE
+from ..geometry.rotation import cross
 from .attitude import Attitude
 from .ephemeris import Orbit
 
@@ -103,7 +104,7 @@ class Motion:
         if self.orbit_frame == "i":
             assert R_ei is not None
             position, velocity = (np.einsum("nij,nj->ni", R_ei, x) for x in (position, velocity))
-            velocity = velocity - np.cross(self.omega_e, position)
+            velocity = velocity - cross(self.omega_e, position)
         R = self.attitude.at(t)
         if self.attitude_frame == "i":
             assert R_ei is not None
@@ -116,7 +117,7 @@ class Motion:
 
     def inertial_velocity(self, position_e: Array, velocity_e: Array) -> Array:
         """Velocity against the stars with components in Earth-fixed axes, ``v_e + omega x r_e`` [D 4.24]."""
-        return velocity_e + np.cross(self.omega_e, position_e)
+        return velocity_e + cross(self.omega_e, position_e)
 
 
 def turned_on(R: Array, before: Array, share: Array) -> Array:
@@ -134,6 +135,6 @@ def R_from_orbital(position: ArrayLike, velocity: ArrayLike) -> Array:
     """
     r, v = np.asarray(position, dtype=float), np.asarray(velocity, dtype=float)
     z = -r / np.linalg.norm(r, axis=-1, keepdims=True)
-    y = -np.cross(r, v)
+    y = -cross(r, v)
     y = y / np.linalg.norm(y, axis=-1, keepdims=True)
-    return np.stack([np.cross(y, z), y, z], axis=-1)
+    return np.stack([cross(y, z), y, z], axis=-1)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..camera.line_camera import CcdLine, Lens, LineCamera
 from ..camera.self_calibration import SelfCalibration
-from ..geometry.rotation import R_BC_NOMINAL
+from ..geometry.rotation import R_BC_NOMINAL, cross
 from ..location.look_directions import LookDirections
 from ..location.pushbroom import SPEED_OF_LIGHT, PushbroomSensor, miss_of
 from ..models.base import CorrectionModel, direct_observations
@@ -124,9 +124,9 @@ def flight_axes_b(sensor: PushbroomSensor, time_s: float) -> Array:
 def track_axes_e(position_e: Array, velocity_e: Array) -> Array:
     """Along the track, across it to the right, and up: columns of (n, 3, 3), from inertial velocities (n, 3)."""
     up = position_e / np.linalg.norm(position_e, axis=1, keepdims=True)
-    across = np.cross(velocity_e, up)
+    across = cross(velocity_e, up)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    return np.stack([np.cross(up, across), across, up], axis=-1)
+    return np.stack([cross(up, across), across, up], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -303,8 +303,8 @@ class _Lines:
         by_point = by_point / distance[:, None, None]
         by_position = -by_point @ self._track
         # the body turned by a: the direction turns by -a, d x a; after a turn t by a - t x a / 2
-        axes = A_b.T[None, :, :] - 0.5 * np.cross(s.turn_b[:, None, :], A_b.T[None, :, :])
-        turned = np.cross(d[:, None, :], axes)  # (n, axis, 3)
+        axes = A_b.T[None, :, :] - 0.5 * cross(s.turn_b[:, None, :], A_b.T[None, :, :])
+        turned = cross(d[:, None, :], axes)  # (n, axis, 3)
         by_turn = by_direction @ np.swapaxes(turned, -1, -2)
         by_six = np.concatenate([by_position, by_turn], axis=2)
         by_theta = np.zeros((len(d), 2, model.n_unknowns))
