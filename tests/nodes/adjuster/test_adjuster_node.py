@@ -18,6 +18,8 @@ from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 
 EPOCH = 1_700_000_000_000_000_000
+#: Where it is not asked when updates come: they take most of the time.
+SELDOM = {"update_s": 1.0, "update_rays": 1000}
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +131,7 @@ def test_the_operator_is_told_what_the_result_rests_on(done, flight):
     texts = [b.message for b in bodies(done[1], "event/log")]
     assert texts[0] == "strip S1 began" and "strip S1 ended" in texts
     assert any(t.startswith("weak: no tie points") for t in texts) and "good" in texts
-    blind = run(Adjuster(grid_hz=2.0), [x for x in flight[1] if x.topic != "observation/control"])
+    blind = run(Adjuster(grid_hz=2.0, **SELDOM), [x for x in flight[1] if x.topic != "observation/control"])
     last = [b.message for b in bodies(blind, "event/log") if b.message.startswith(("good", "weak", "failed"))]
     assert "good" not in last[:-1]
     in_flight = [text for text in last if "over: " not in text]
@@ -148,7 +150,7 @@ def test_a_strip_that_is_flown_again_under_its_name_is_told_and_left_out(done, f
             0,
             strip.first_line_time_ns + later_s * convert.SECOND_NS,
         )
-    node = Adjuster(grid_hz=2.0)
+    node = Adjuster(grid_hz=2.0, **SELDOM)
     for message in flight[1]:
         node.step(message)
     texts = [
@@ -248,7 +250,7 @@ def test_killed_and_restarted_in_flight_it_catches_up(done, flight):
     simulation, messages = flight
     latched = [x for x in messages if x.topic.startswith("configuration/") or x.topic == "observation/control"]
     again = [x for x in latched if x.stamp_ns < EPOCH + 9e9] + [x for x in messages if x.stamp_ns >= EPOCH + 9e9]
-    node = Adjuster(grid_hz=10.0)
+    node = Adjuster(grid_hz=10.0, **SELDOM)
     outputs = run(node, again)
     final = bodies(outputs, "orientation/final")
     assert seconds(final[0]) < 9.2 and seconds(final[-1]) > 29.8
@@ -267,14 +269,14 @@ def test_invalid_poses_make_invalid_orientation(flight):
             body.valid, body.reason = False, "no GNSS for 3.0 s"
             x = Message(x.topic, x.stamp_ns, body)
         messages.append(x)
-    outputs = run(Adjuster(grid_hz=10.0, update_s=0.5), messages)
+    outputs = run(Adjuster(grid_hz=10.0, **SELDOM), messages)
     for topic in ("orientation/live", "orientation/final"):
         invalid = [p for p in bodies(outputs, topic) if not p.valid]
         assert 8 <= len(invalid) <= 12 and all(p.reason == "no GNSS for 3.0 s" for p in invalid)
 
 
 def test_an_imported_trajectory_without_filter_output_works_too(flight):
-    outputs = run(Adjuster(grid_hz=10.0, update_s=0.5), [x for x in flight[1] if x.topic != "trajectory/filtered"])
+    outputs = run(Adjuster(grid_hz=10.0, **SELDOM), [x for x in flight[1] if x.topic != "trajectory/filtered"])
     assert len(bodies(outputs, "orientation/live")) > 250
     assert len(bodies(outputs, "orientation/final")) > 270
 
@@ -327,7 +329,7 @@ def test_refused_control_is_in_the_report_and_in_the_log(flight):
         return [message]
 
     # a focal length that is unknown takes a little of 47 m, and Y of a point at the edge of the image is refused, too
-    adjuster = Adjuster(grid_hz=2.0, datum="gnss", self_calibration="none")
+    adjuster = Adjuster(grid_hz=2.0, datum="gnss", self_calibration="none", **SELDOM)
     outputs = run(adjuster, with_control(flight[1], raised))
     refused = [r for body in bodies(outputs, "adjustment/report") for r in body.rejected if r.coordinate]
     assert refused and {(r.coordinate, r.reason) for r in refused} == {("Z", "contradicts")}
@@ -351,7 +353,7 @@ def test_every_look_that_a_test_refused_has_its_w(flight):
             body.images[0].sample += rng.choice([-1.0, 1.0]) * rng.uniform(10.0, 80.0)
             message = replace(message, body=body)
         messages.append(message)
-    outputs = run(Adjuster(grid_hz=2.0, update_s=0.5), messages)
+    outputs = run(Adjuster(grid_hz=2.0, **SELDOM), messages)
     rejected = [r for body in bodies(outputs, "adjustment/report") for r in body.rejected if r.reason == "snooping"]
     assert len(rejected) > 20 and all(r.w > 0.0 for r in rejected)
     assert np.median([r.w for r in rejected]) > 5.0
@@ -371,7 +373,7 @@ def test_control_that_comes_or_changes_in_flight_is_told(done, flight):
     del surer.covariance[:]
     surer.covariance.extend([1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 2.5e-3])
     news = [replace(mine[0], stamp_ns=late), *(Message("observation/control", late, b) for b in (changed, surer))]
-    said = [text for text, _ in lines(run(Adjuster(grid_hz=2.0, update_s=0.5), rest[:first] + news + rest[first:]))]
+    said = [text for text, _ in lines(run(Adjuster(grid_hz=2.0, **SELDOM), rest[:first] + news + rest[first:]))]
     assert f"control came in flight: {mine[0].body.point}" in said
     words = f"{surer.point} in its sigmas, from 0.02, 0.02, 0.02 to 0.01, 0.01, 0.05 m"
     assert f"control changed in flight: {changed.point} by 0.00, 0.00, 0.50 m, {words}" in said
@@ -403,7 +405,7 @@ def test_a_strip_joined_in_its_middle_says_so_and_begins_there(done, flight):
     joined = start + 15 * convert.SECOND_NS
     known = ("configuration/", "observation/control")
     late = [x for x in flight[1] if x.topic.startswith(known) or x.stamp_ns >= joined]
-    node = Adjuster(grid_hz=2.0, update_s=0.5)
+    node = Adjuster(grid_hz=2.0, **SELDOM)
     outputs = run(node, late)
     said = [text for text, _ in lines(outputs) if "joined" in text]
     assert len(said) == 1 and said[0].startswith("strip S1 is joined 1") and "neither final nor whole" in said[0]
@@ -428,7 +430,7 @@ def test_another_project_in_flight_starts_the_window_again_and_live_orientation_
             body.valid, body.reason = False, "aligning"
             x = replace(x, body=body)
         spoilt.append(x)
-    node = Adjuster(grid_hz=10.0, update_s=0.5)
+    node = Adjuster(grid_hz=10.0, **SELDOM)
     outputs = run(node, [*spoilt, again, *messages[k:]])
     times = np.array([seconds(p) for p in bodies(outputs, "orientation/live")])
     grid = np.unique(times[np.abs(10 * times - np.round(10 * times)) < 1e-6].round(6))

@@ -84,7 +84,7 @@ def fly(seed: int, strip_s: float, grade=MEMS, ties_per_s: float = 5.0):
 
 
 def adjuster_of(apriori: str = "trajectory") -> Adjuster:
-    return Adjuster(apriori=apriori, update_s=0.5)
+    return Adjuster(apriori=apriori, update_s=1.0, update_rays=1000)
 
 
 def run(adjuster: Adjuster, simulation, hole_s=(0.0, 0.0), killed_s: float = np.inf) -> list:

@@ -31,7 +31,7 @@ def messages():
 
 def run(messages, **settings):
     """Outputs, each with when it came (s), and counters."""
-    node, out = Adjuster(grid_hz=2.0, pace="normal", update_s=1.0, **settings), []
+    node, out = Adjuster(grid_hz=2.0, pace="normal", update_s=1.0, update_rays=1000, **settings), []
     for message in messages:
         out += [((message.stamp_ns - EPOCH_NS) * 1e-9, o) for o in node.step(message)]
     return out + [(float("inf"), o) for o in node.finish()], node.counters

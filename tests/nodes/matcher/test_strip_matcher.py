@@ -211,7 +211,7 @@ def test_strips_of_one_ccd_line_in_any_direction_are_tied_by_their_images_alone(
     sensor, flight, out = tmp_path / "camera.json", tmp_path / "flight.mcap", tmp_path / "out.mcap"
     sensor.write_text(CAMERA)
     plan = ["--strips", "2", "--cross", "1", "--sidelap", "0.6", "--seconds", "12", "--height", "1000", "--speed", "60"]
-    simulate = ["simulate", "-q", "-o", str(flight), "--sensor", str(sensor), "--images", *plan, "--no-turns"]
+    simulate = ["simulate", "-q", "-o", str(flight), *SENSORS, str(sensor), "--images", *plan, "--no-turns"]
     assert main([*simulate, "--control", "0", "--check", "0", "--lead-in", "3", "--seed", "3"]) == 0
     capsys.readouterr()
     settings = tmp_path / "nodes.toml"

@@ -185,7 +185,7 @@ def test_a_drift_that_control_meets_first_is_named_and_control_counts(flight):
     ids = np.array([line.id for line in simulation.flight.camera.lines])
     sample = np.where(ids[looks.ccd] == "F", 0.03 * looks.time_s, 0.0)
     spoilt = replace(simulation, images=replace(images, sample=images.sample + sample))
-    online = adjust_online(spoilt, poses, WindowOptions(grid_hz=4.0), live=False, update_s=0.5)
+    online = adjust_online(spoilt, poses, WindowOptions(grid_hz=4.0), live=False, update_s=1.0)
     alarms = [r.quality.sources for r in online.reports if r.quality.sources]
     assert alarms and all(("", "F") in sources[0].suspects for sources in alarms)
     refused = {(r.point, r.coordinate) for r in online.refused if r.reason == CONTRADICTS}
@@ -203,7 +203,7 @@ def test_control_that_is_wrong_is_not_blamed_on_the_tie_points(flight):
     surveyed = simulation.surveyed_l.copy()
     surveyed[wrong, 2] -= 8.0
     spoilt = replace(simulation, surveyed_l=surveyed)
-    online = adjust_online(spoilt, poses, WindowOptions(grid_hz=4.0), live=False, update_s=0.5)
+    online = adjust_online(spoilt, poses, WindowOptions(grid_hz=4.0), live=False, update_s=1.0)
     assert not any(r.quality.sources or "tie points" in r.quality.reason for r in online.reports if r.control)
     refused = {(r.point, r.coordinate) for r in online.refused if r.reason == CONTRADICTS}
     assert refused == {(str(simulation.points.id[wrong]), "Z")}

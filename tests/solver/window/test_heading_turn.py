@@ -53,7 +53,9 @@ def flown():
             kept.append(copy.deepcopy(max(window.network.batches, key=lambda b: len(b.rays))))
 
     simulation = misheaded(1)
-    return simulation, adjust_online(simulation, navigate(simulation), WindowOptions(grid_hz=5.0), watch=watch), kept[0]
+    options = WindowOptions(grid_hz=5.0)
+    result = adjust_online(simulation, navigate(simulation), options, live=False, watch=watch, update_s=1.0)
+    return simulation, result, kept[0]
 
 
 def test_a_window_finds_the_heading_and_refuses_next_to_nothing(flown):

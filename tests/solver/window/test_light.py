@@ -313,7 +313,7 @@ def fly(seed, ties=8.0, control=6, strip_s=60.0, limit_m=0.0):
             rows.append((now, watched, on_ground))
 
     options = WindowOptions(grid_hz=2.0, alert_limit_m=limit_m)
-    result = adjust_online(simulation, navigate(simulation), options, watch=watch, update_s=0.5, live=False)
+    result = adjust_online(simulation, navigate(simulation), options, watch=watch, update_s=1.0, live=False)
     return rows, result
 
 

@@ -168,7 +168,7 @@ def test_several_strips():
 def test_additional_parameters_are_estimated_along(flight):
     simulation, poses = flight
     options = WindowOptions(determine=False)
-    result = adjust_online(simulation, poses, options, tls(simulation.flight.camera), live=False, update_s=0.5)
+    result = adjust_online(simulation, poses, options, tls(simulation.flight.camera), live=False, update_s=1.0)
     names = [p.name for p in result.reports[-5].parameters]
     assert names[9:] == list(tls(simulation.flight.camera).names)
     values = {p.name: p for p in result.reports[-5].parameters}
@@ -351,7 +351,7 @@ def test_looks_of_a_time_without_poses_wait_for_smoothed_ones(flight, adjusted):
 def test_what_is_final_stays_final(flight):
     simulation, poses = flight
     # an own one: looks are added to its window
-    result = adjust_online(simulation, poses, live=False, update_s=0.5)
+    result = adjust_online(simulation, poses, live=False, update_s=1.0)
     times = np.concatenate([o.time_s for o in result.final])
     assert (np.diff(times) > 0).all() and np.diff(times).max() == pytest.approx(0.05)
     strip = simulation.flight.strips[0]
@@ -379,10 +379,10 @@ def test_control_that_comes_late_still_counts(flight):
             sigma["before"] = window.live(27.9).covariance[0, 0, 0]
             for name in names:
                 window.add_control(name, given[name], np.full(3, 0.02), "control")
-        if abs(now - 28.5) < 0.05:
+        if abs(now - 29.0) < 0.05:
             sigma["after"] = window.live(27.9).covariance[0, 0, 0]
 
-    adjust_online(blind, poses, WindowOptions(window_s=NEVER), live=False, watch=watch, update_s=0.5)
+    adjust_online(blind, poses, WindowOptions(window_s=NEVER), live=False, watch=watch, update_s=1.0)
     assert sigma["after"] < 0.5 * sigma["before"]
 
 

@@ -34,7 +34,7 @@ def flight():
 
 @pytest.fixture(scope="module")
 def online(flight):
-    return adjust_online(*flight, WindowOptions(grid_hz=4.0), update_s=0.5)
+    return adjust_online(*flight, WindowOptions(grid_hz=4.0), update_s=1.0)
 
 
 # ---- robust start
@@ -145,7 +145,7 @@ def test_the_effect_of_an_undetected_error_is_what_the_adjustment_makes_of_it(fl
         state.solve()
         seen["said"], seen["is"] = said, state.theta - before
 
-    adjust_online(simulation, poses, live=False, watch=watch, update_s=0.5)
+    adjust_online(simulation, poses, live=False, watch=watch, update_s=1.0)
     scale = np.abs(seen["is"]).max()
     assert scale > 0
     np.testing.assert_allclose(seen["said"], seen["is"], atol=1e-6 * scale)
@@ -185,7 +185,7 @@ def test_the_exposure_is_the_largest_effect_of_all_observations(flight):
             assert found.observation == worst.in_words and bool(found.names) == (worst.axis >= 0)
             compared.append((worst.axis >= 0, worst.batch is None))
 
-    adjust_online(simulation, poses, WindowOptions(determine=False), live=False, watch=watch, update_s=0.5)
+    adjust_online(simulation, poses, WindowOptions(determine=False), live=False, watch=watch, update_s=1.0)
     of_control, has_left = np.array(compared).T
     assert of_control.any() and not of_control.all() and has_left.any() and not has_left.all()
 
