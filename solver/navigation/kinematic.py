@@ -98,7 +98,7 @@ class KinematicFilter:
     @cached_property
     def _ahead(self) -> list[tuple[Array, Array, Array, Array]]:
         """What takes the covariance of an epoch to the times after it: of the position, and without the slow errors."""
-        found = []
+        found: list[tuple[Array, Array, Array, Array]] = []
         for dt in _AHEAD_S:
             F, Q = self._transition(float(dt))
             found.append((F[P], Q[P, P], self._H @ F, self._H @ Q @ self._H.T))
