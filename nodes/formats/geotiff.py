@@ -198,7 +198,9 @@ def tiled_orthoimage(
     import rasterio.shutil
     from rasterio.crs import CRS
 
-    predictor: dict[str, Any] = {} if compress == "none" else {"predictor": "yes"}
+    predictor: dict[str, Any] = {}
+    if compress != "none" and _differences(raster.dtype):
+        predictor = {"predictor": "yes"}
     with new_file(path) as part:
         draft = part.with_suffix(".draft")
         try:
@@ -262,7 +264,7 @@ def pieces_of_raster(path: Path, raster: Raster, block: int = BLOCK) -> Iterator
     from rasterio.crs import CRS
     from rasterio.errors import NotGeoreferencedWarning
 
-    predictor = 3 if np.dtype(raster.dtype).kind == "f" else 2
+    predictor = 3 if np.dtype(raster.dtype).kind == "f" else 2 if _differences(raster.dtype) else 1
     with warnings.catch_warnings(), new_file(path) as part:
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         with _told(path):
@@ -369,14 +371,23 @@ def cloud_optimised(path: Path, source: Path, compress: str = "deflate", overvie
     import rasterio.shutil
     from rasterio.errors import NotGeoreferencedWarning
 
-    predictor: dict[str, Any] = {} if compress == "none" else {"predictor": "yes"}
     with warnings.catch_warnings(), new_file(path) as part, rasterio.Env(GDAL_CACHEMAX=CACHE_MB), _told(path):
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(source) as raster:
+            differences = compress != "none" and _differences(raster.dtypes[0])
+        predictor: dict[str, Any] = {"predictor": "yes"} if differences else {}
         rasterio.shutil.copy(
             source, part, driver="COG", compress=compress, blocksize=BLOCK, bigtiff="if_safer",
             overview_resampling=overview_resampling, num_threads="all_cpus", **predictor,
         )  # fmt: skip
         _refuse_cut(part, path)
+
+
+def _differences(dtype: str) -> bool:
+    """Whether differences of neighbours are compressed: not of 64-bit whole numbers, as libtiff up to 4.3 cannot read
+    them."""
+    kind = np.dtype(dtype)
+    return kind.kind == "f" or kind.itemsize < 8
 
 
 @contextmanager

@@ -96,7 +96,8 @@ class LineRing:
         ValueError : lines of another length
         """
         if pixels.shape[1:] != (self.samples,):
-            raise ValueError(f"lines of {' x '.join(map(str, pixels.shape[1:])) or 'no'} samples, wanted {self.samples}")
+            width = " x ".join(map(str, pixels.shape[1:])) or "no"
+            raise ValueError(f"lines of {width} samples, wanted {self.samples}")
         usable = np.ones(len(pixels), dtype=bool) if usable is None else usable
         if self.start == self.end:
             self.start = self.end = self._seen_end = first_line
