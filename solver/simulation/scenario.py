@@ -263,7 +263,8 @@ def slow_errors(flight: Flight, seed: int, errors: ErrorModel, world: World | No
 def measure_points(
     flight: Flight, seed: int, plan: ObservationPlan, world: World | None = None
 ) -> tuple[GroundPoints, Array, ImageMeasurements]:
-    """Ground points, their surveyed coordinates (m, 3), and their images; points with fewer than two rays drop out."""
+    """Ground points, their surveyed coordinates (m, 3), and their images; points with fewer than two rays drop out, but
+    for control, of which one says something."""
     world = world or AS_STATED
     control_rng = stream(seed, "control")
     points = place_points(flight, plan.tie_points_per_s, plan.control, plan.check, stream(seed, "points"), control_rng)
@@ -271,7 +272,7 @@ def measure_points(
     images = measure_images(flight, points, looks, plan, stream(seed, "image noise"), stream(seed, "outliers"), world)
 
     rays = np.bincount(images.looks.point, minlength=len(points))
-    kept = rays >= 2
+    kept = rays >= np.where(points.role == "control", 1, 2)
     survey_error = control_rng.standard_normal((len(points), 3)) * plan.control_sigma_m + world.control_datum_m
     surveyed = points.xyz_l + np.where((points.role == "control")[:, None], survey_error, 0.0)
     images = images.select(kept[images.looks.point])

@@ -236,6 +236,19 @@ def test_recording_holds_the_flight(tmp_path, capsys):
     assert all(numbers == list(range(len(numbers))) for numbers in by_topic.values())
 
 
+def test_control_of_a_camera_with_one_ccd_line_is_measured_where_one_strip_sees_it(tmp_path, capsys):
+    camera = {
+        "name": "one line",
+        "lenses": [{"id": "L", "focal_length_mm": 62.7, "principal_point_mm": [0.0, 0.0]}],
+        "lines": [{"id": "N", "lens": "L", "pixels": 1500, "pixel_size_mm": 0.052, "center_mm": [0.0, 0.0]}],
+    }
+    (tmp_path / "one.json").write_text(json.dumps(camera))
+    options = ["--sensor", str(tmp_path / "one.json"), "--control", "4", "--check", "4", "--attitude-rate", "20"]
+    assert main([*QUICK, "-o", str(tmp_path / "f.mcap"), "--json", *options]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["points"] == {"tie": 0, "control": 4, "check": 0} and result["rays"] == 4
+
+
 def test_a_camera_whose_lines_lie_along_the_flight_is_refused(tmp_path, capsys):
     """It would see the ground along its own track."""
     line = {"id": "N", "lens": "L", "pixels": 100, "pixel_size_mm": 0.1, "center_mm": [0, 0], "inclination_deg": 90}
