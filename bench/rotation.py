@@ -1,4 +1,4 @@
-"""What own code for rotations costs beside SciPy's Rotation, call by call: why it is kept.
+"""What own code for rotations costs beside SciPy's Rotation (and NumPy's cross product), call by call: why it is kept.
 
     python bench/rotation.py
 
@@ -54,6 +54,7 @@ def cases(shape: tuple[int, ...]) -> dict[str, tuple[Callable[[], Any], Callable
             lambda: (Rotation.from_quat(q) * Rotation.from_quat(q)).as_quat(),
         ),
         "quaternion_conjugate": (lambda: own.quaternion_conjugate(q), lambda: Rotation.from_quat(q).inv().as_quat()),
+        "cross, beside NumPy's": (lambda: own.cross(a, q[..., :3]), lambda: np.cross(a, q[..., :3])),
         "vector_from_quaternion": (lambda: own.vector_from_quaternion(q), lambda: Rotation.from_quat(q).as_rotvec()),
     }
 

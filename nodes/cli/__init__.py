@@ -50,8 +50,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
 def parse(argv: list[str]) -> argparse.Namespace:
     """Parse the words behind ``triline``; an unknown option is reported with the usage of its command."""
     command = _command(argv)
-    # where the command comes first nothing lists the others
-    parser, subparser = _parser(command if command in COMMANDS else None, alone=argv[:1] == [command])
+    # where a command comes first nothing lists the others, whose parsers take longest
+    comes_first = command in COMMANDS and argv[0] == command
+    parser, subparser = _parser(command, [command] if comes_first else list(COMMANDS))
     args, unknown = parser.parse_known_args(argv)
     if unknown:
         (subparser or parser).error(f"unrecognized arguments: {' '.join(unknown)}")
@@ -62,21 +63,19 @@ def _command(argv: list[str]) -> str:
     return next((word for word in argv if not word.startswith("-")), "")
 
 
-def _parser(command: str | None, alone: bool = False) -> tuple[argparse.ArgumentParser, argparse.ArgumentParser | None]:
-    """The parser, and that of the command; ``alone`` without those of the others, which take most of the time."""
+def _parser(command: str, names: list[str]) -> tuple[argparse.ArgumentParser, argparse.ArgumentParser | None]:
+    """The parser of commands by name, and that of the one that was given, which alone has its options."""
     chosen = None
     parser = argparse.ArgumentParser(
         prog="triline",
         description="On-line triangulation for line-scanner (pushbroom) cameras.",
         epilog="'triline COMMAND --help' shows the options of a command and an example.",
     )
-    alone = alone and command is not None
-    if not alone:
+    if names != [command]:
         parser.add_argument("--version", action="version", version=_version())
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for name, (module_name, text) in COMMANDS.items():
-        if alone and name != command:
-            continue
+    for name in names:
+        module_name, text = COMMANDS[name]
         sub = subparsers.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         sub.formatter_class = argparse.RawDescriptionHelpFormatter
         if name == command:

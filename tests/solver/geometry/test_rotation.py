@@ -79,6 +79,8 @@ def test_quaternions_and_matrices_of_any_shape(shape):
 @pytest.mark.parametrize("shape", [(3,), (5, 3), (2, 4, 3)])
 def test_skew_is_the_cross_product(shape):
     a, b = RNG.normal(size=shape), RNG.normal(size=shape)
+    np.testing.assert_array_equal(rot.cross(a, b), np.cross(a, b))
+    np.testing.assert_array_equal(rot.cross(a.reshape(-1, 3)[0], b), np.cross(a.reshape(-1, 3)[0], b))
     np.testing.assert_allclose(np.einsum("...ij,...j->...i", rot.skew(a), b), np.cross(a, b), atol=1e-14)
 
 
