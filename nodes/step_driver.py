@@ -27,11 +27,16 @@ class StepDriver:
     ----------
     node : the node
     clock : measures the wall time of a step, s, for messages that tell it (``compute_s``); None = they tell nothing
+
+    Attributes
+    ----------
+    first_failure : at what the node's work failed first, and how; empty if it did not
     """
 
     def __init__(self, node: Node, clock: Callable[[], float] | None = None) -> None:
         self.node = node
         self.time_ns = 0
+        self.first_failure = ""
         self.voices = Voices()
         self._clock = clock
         self._sequences: Counter[str] = Counter()
@@ -92,7 +97,9 @@ class StepDriver:
             outputs.extend(work(*given))  # a generator's outputs before a failure count
         except Exception as error:  # whatever a message does to a node, the node lives
             place = _innermost(error)
-            self.node.problem("failed", f"{_cause(*given)}: {type(error).__name__}: {error} ({place})")
+            text = f"{_cause(*given)}: {type(error).__name__}: {error} ({place})"
+            self.node.problem("failed", text)
+            self.first_failure = self.first_failure or text
         if not outputs:
             return outputs
         elapsed = self._clock() - begun if self._clock else 0.0
@@ -107,6 +114,12 @@ class StepDriver:
         self._sequences[output.topic] += 1
         stamp = max(output.stamp_ns, self.time_ns)
         return Message(output.topic, stamp, output.body, self.node.name, sequence)
+
+
+def failure_words(times: int, why: str) -> str:
+    """What is told of a node whose work failed so often; ``why`` says at what."""
+    how_often = {1: "once", 2: "twice"}.get(times, f"{times} times")
+    return f"failed {how_often}, its results are not complete; {why}"
 
 
 def _cause(*given: Any) -> str:

@@ -24,6 +24,7 @@ from ..bus.program import end_by_signal
 from ..errors import UserError
 from ..formats.new_file import refuse_unless_folder
 from ..monitor.monitor import ENDING, display
+from ..step_driver import failure_words
 
 if TYPE_CHECKING:
     from ..bus.session import Bus
@@ -378,9 +379,7 @@ def failed_nodes(statuses: Mapping[str, Any]) -> dict[str, str]:
     for name, status in statuses.items():
         times = sum(counter.value for counter in status.counters if counter.name == "failed")
         if times:
-            failed[name] = (
-                f"failed {times} times, its results are not complete; its last problem: {status.last_problem}"
-            )
+            failed[name] = failure_words(times, f"its last problem: {status.last_problem}")
     return failed
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import textwrap
 import time
 from collections.abc import Sequence
@@ -123,6 +124,8 @@ def run(args: argparse.Namespace) -> int:
     finally:
         part.unlink(missing_ok=True)
     seconds = time.monotonic() - begun
+    for name, text in summary.failed.items():
+        print(f"triline process: {reader.path}: {name} {text}", file=sys.stderr)
     if args.json:
         more = {"pace": pace, "notes": [*summary.notes, *notes]}
         print(json_text(result(summary, reader, args.output, seconds) | more))
@@ -207,6 +210,7 @@ def result(summary: ProcessSummary, reader: RecordingReader, output: Path, secon
         "lost_bytes": sum(damage.length for damage in reader.damage),
         "counters": summary.counters,
         "problems": summary.problems,
+        "failed": summary.failed,
         "flight_s": (summary.last_ns - summary.first_ns) / 1e9,
         "seconds": round(seconds, 3),
     }

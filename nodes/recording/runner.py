@@ -18,7 +18,7 @@ from ...schemas.envelope import Envelope, RawMessage
 from ...schemas.topics import Family
 from ..node import Message, Node
 from ..ordering import Key, order_key
-from ..step_driver import StepDriver
+from ..step_driver import StepDriver, failure_words
 from ..voices import VERDICT
 from .index import Recorded
 from .reader import RecordingReader
@@ -40,6 +40,7 @@ class ProcessSummary:
     notes : what of the recording was used and should be known
     counters : per node, what it counted
     problems : per node, its last problem
+    failed : per node whose work failed, how often, and at what first
     states : per node, what it said of itself at the end
     first_ns, last_ns : platform time of what was measured and computed, 0 without any
     """
@@ -53,6 +54,7 @@ class ProcessSummary:
     last_problem: str = ""
     counters: dict[str, dict[str, int]] = field(default_factory=dict)
     problems: dict[str, str] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
     states: dict[str, str] = field(default_factory=dict)
     first_ns: int = 0
     last_ns: int = 0
@@ -69,6 +71,7 @@ class ProcessSummary:
         self.last_problem = other.last_problem or self.last_problem
         self.counters |= other.counters
         self.problems |= other.problems
+        self.failed |= other.failed
         self.states |= other.states
 
 
@@ -467,6 +470,9 @@ class _Line:
             self._summary.states[node.name] = node.state()
             if node.last_problem:
                 self._summary.problems[node.name] = node.last_problem
+            if inbox.driver.first_failure:
+                why = f"the first time at {inbox.driver.first_failure}"
+                self._summary.failed[node.name] = failure_words(node.counters["failed"], why)
             self.work_off()
         for _, _, item in sorted(self._last):
             self._hand_out(item)

@@ -42,6 +42,7 @@ def write_page(path: Path, result: dict[str, Any]) -> None:
         all_tiles=_tiles(result),
         flights=[_cells(row) for row in rows],
         failures=[cells for row in rows for cells in _failures(row)],
+        incomplete=[[row["flight"], "; ".join(row["incomplete"])] for row in rows if row["incomplete"]],
         damaged=[[row["flight"], "; ".join(row["damage"])] for row in rows if row["damage"]],
         steps=list(dict.fromkeys(name for row in rows for name in row["steps"])),
     )

@@ -21,7 +21,8 @@ from .integrity import LIGHTS
 MOST_LINES = 60
 _COLUMNS = (
     "flight", "state", "seconds", "strips", "rays", "rejected", "sigma0", "nees", "good", "weak", "failed", "rmse_X_m",
-    "rmse_Y_m", "rmse_Z_m", "against", "adjust_sigma0", "adjust_rejected", "damage", "reason", "recording",
+    "rmse_Y_m", "rmse_Z_m", "against", "adjust_sigma0", "adjust_rejected", "damage", "incomplete",
+    "reason", "recording",
 )  # fmt: skip
 
 
@@ -34,6 +35,7 @@ def flight_rows(plans: Sequence[Plan], progress: Progress) -> list[dict[str, Any
 
     - ``flight, recording, bytes``; ``state``: "finished", "failed" or "unfinished"; ``reason``: of the first failure;
       ``damage``: what of the recording could not be read, a line each, as the first step that met it said;
+      ``incomplete``: nodes whose work failed at some messages, a line each;
     - ``steps``: by name ``state`` ("finished", "failed", "not begun"), ``reason``, ``seconds`` (of the job),
       ``attempts``, ``output`` and ``log`` (paths below the folder of results, None where they are not);
     - ``seconds, strips, rays, rejected, sigma0, nees, light`` (shares of LIGHTS in ``lit_s``, the time on strips),
@@ -61,6 +63,7 @@ def _row(plan: Plan, progress: Progress) -> dict[str, Any]:
         "state": state,
         "reason": next((f"{name}: {step['reason']}" for name, step in steps.items() if step["reason"]), None),
         "damage": next(filter(None, map(_damage, told.values())), []),
+        "incomplete": [f"{node} {text}" for node, text in (told.get("process", {}).get("failed") or {}).items()],
         "steps": steps,
         "seconds": held.get("seconds"),
         "strips": held.get("strips"),
@@ -122,7 +125,8 @@ def write_tables(out: Path, result: dict[str, Any]) -> None:
     for row in result["flights"]:
         light, rmse, adjusted = row["light"] or {}, row["rmse_m"] or (None,) * 3, row["adjust"] or {}
         cells = {
-            **row, "damage": "; ".join(row["damage"]) or None, **{name: light.get(name) for name in LIGHTS},
+            **row, **{key: "; ".join(row[key]) or None for key in ("damage", "incomplete")},
+            **{name: light.get(name) for name in LIGHTS},
             "rmse_X_m": rmse[0], "rmse_Y_m": rmse[1], "rmse_Z_m": rmse[2],
             "adjust_sigma0": adjusted.get("sigma0"), "adjust_rejected": adjusted.get("rejected"),
         }  # fmt: skip
@@ -155,6 +159,7 @@ def table_lines(rows: Sequence[dict[str, Any]], every: bool = False) -> list[str
         )
         if row["damage"]:
             lines.append(f"{'':<{width}}  damaged recording: {'; '.join(row['damage'])}")
+        lines += [f"{'':<{width}}  {text}" for text in row["incomplete"]]
     if len(shown) < len(rows):
         lines.append(f"... and {len(rows) - len(shown)} more, in summary.csv (-v prints all)")
     return lines

@@ -57,7 +57,7 @@ def test_a_node_whose_work_failed_is_named_at_the_end(tmp_path):
     failed = failed_nodes(statuses)
     assert list(failed) == ["adjuster"]
     said = demo(tmp_path).summary({**RESULT, "recordings": [], "failed": failed})
-    assert "adjuster: failed 1 times, its results are not complete; its last problem: the end: ValueError: by" in said
+    assert "adjuster: failed once, its results are not complete; its last problem: the end: ValueError: by" in said
 
 
 def test_a_file_is_neither_a_flight_nor_a_folder_of_results(tmp_path, capsys):

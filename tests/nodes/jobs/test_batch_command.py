@@ -173,6 +173,31 @@ def test_a_recording_that_is_cut_off_is_told(season, steps, capsys):
     assert told in Path("out/index.html").read_text()
 
 
+#: Read by every Python that is started with its folder on PYTHONPATH.
+FAILING = """
+from triline.nodes.navigator.navigator import Navigator
+
+def fail(self):
+    raise ValueError("by design")
+
+Navigator.finish = fail
+"""
+
+
+def test_nodes_whose_work_failed_are_named(season, tmp_path, monkeypatch, capsys):
+    """Their flights were finished as any other."""
+    (tmp_path / "sitecustomize.py").write_text(FAILING)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    process = ("--do", "process", "--with", "process --nodes navigator")
+    assert main(["batch", str(Path("season/day1/f1.mcap")), "-o", "out", *process]) == 0
+    why = "navigator failed once, its results are not complete; the first time at the end: ValueError: by design"
+    assert capsys.readouterr().out.count(f" {why} (sitecustomize.py:5)\n") == 1
+    (row,) = summary()["flights"]
+    assert row["state"] == "finished" and [text.partition(" (")[0] for text in row["incomplete"]] == [why]
+    assert why in Path("out/summary.csv").read_text().splitlines()[-1]
+    assert why in Path("out/index.html").read_text()
+
+
 def test_a_step_whose_input_failed_is_not_begun(season, capsys):
     Path("none.mcap").write_bytes(b"no recording")
     assert main(["batch", "none.mcap", "-o", "out", "--do", "process,analyze,adjust"]) == 1
