@@ -42,6 +42,8 @@ MOSTLY_REFUSED, ENOUGH_POINTS = 0.5, 20
 DATUM_HELD = 0.5
 #: Object points with two rays that the window must have: as many as a relative orientation of two frames.
 LEAST_POINTS = 6
+#: Share of looks that come too late above which that is why there are few: of three views one is (tuned).
+MANY_LATE = 0.3
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,7 @@ class QualityFindings:
     fit : of the observations to their sigmas
     points, refused, tied : object points in the window, those without a ray left, and those with two or more
     free : of the latter those that are no ground points with given coordinates; None: not known
+    late : share of the strip's looks that came when the window had passed them
     control, control_refused : (3,) X, Y and Z coordinates of control in use; control points without a ray left
     control_doubt, control_failed : what control contradicts, itself or the GNSS, and what the surface that points lie
         on does, in words, "" where they do not; and whether control does by so much that no sigma can be relied on
@@ -120,6 +123,7 @@ class QualityFindings:
     reason: str = ""
     events: tuple[str, ...] = ()
     free: int | None = None
+    late: float = 0.0
     held_by: str = "earlier control"
 
     @property
@@ -177,7 +181,11 @@ def _tie_points(s: QualityFindings) -> tuple[str, str] | None:
         when = "yet" if s.since_s < s.length_s else within
         return WEAK, f"no tie points {when}: the orientation is the measured one"
     if s.tied < LEAST_POINTS:
-        return WEAK, f"too few tie points {within}: {s.tied} are seen twice, wanted {LEAST_POINTS}"
+        passed = ""
+        if s.late > MANY_LATE:
+            share = f"{100.0 * s.late:.0f} % of the looks came when the window had passed them"
+            passed = f"; {share}: is it shorter than from one view to the next?"
+        return WEAK, f"too few tie points {within}: {s.tied} are seen twice, wanted {LEAST_POINTS}{passed}"
     if s.free == 0:  # ground points alone look good, and say nothing of what lies between them
         return WEAK, f"nothing but ground points is matched {within}, no tie point: is the height of the ground right?"
     return None

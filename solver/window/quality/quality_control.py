@@ -118,6 +118,7 @@ class QualityControl:
             refused=int((rays == 0).sum()),
             tied=tied,
             free=tied - self._tied_control(),
+            late=0.0 if strip is None else network.intake.late_share(strip.id),
             control=known[rays > 0].sum(axis=0),
             control_refused=sum(b.control_refused for b in batches),
             control_doubt="; ".join(filter(None, (self._control.doubt, self._surface.doubt))),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
@@ -73,6 +74,8 @@ class PointLooks:
     spent: bool = False
 
 
+#: Why a look is refused whose time is final.
+TOO_LATE = "too late"
 #: Time after which a look whose orientation has not come is given up, s.
 PATIENCE_S = 2.0
 
@@ -85,12 +88,14 @@ class Intake:
     points : all points that are not final
     control : known coordinates by point
     looked : names of the strips of which a look was ever taken
+    came : by strip, how many looks at points came that the window was there for, and that it had passed
     """
 
     def __init__(self, camera: LineCamera, strips: dict[str, WindowStrip], trajectory: MeasuredTrajectory):
         self.points: dict[str, PointLooks] = {}
         self.control: dict[str, ControlPoint] = {}
         self.looked: set[str] = set()
+        self.came: defaultdict[str, Counter[bool]] = defaultdict(Counter)
         self._camera, self._strips, self._trajectory = camera, strips, trajectory
         self._arrived: dict[str, None] = {}
         self._waiting: dict[str, None] = {}
@@ -109,7 +114,10 @@ class Intake:
     def add_look(self, name: str, look: Look) -> str:
         """Take a look, or say why not."""
         time_s = self._time_of(look)
-        reason = self._judge(look) or self._judge_time(name, look, time_s)
+        reason = self._judge(look)
+        if not reason:
+            reason = self._judge_time(name, look, time_s)
+            self.came[look.strip][reason == TOO_LATE] += 1
         if reason:
             self._refused.append(Refusal(name, look, reason))
             return reason
@@ -124,6 +132,11 @@ class Intake:
         if point.batch is None:
             self._waiting[name] = None
         return ""
+
+    def late_share(self, strip: str) -> float:
+        """Share of the looks of a strip that came when the window had passed them."""
+        came = self.came[strip]
+        return came[True] / max(came.total(), 1)
 
     def known_coordinates(self, names: Sequence[str], used: Bools) -> ControlWeights:
         """Known coordinates of points; those that are refused, and those ``used`` (p,) by earlier strips, take no
@@ -176,7 +189,7 @@ class Intake:
 
     def _judge_time(self, name: str, look: Look, time_s: float) -> str:
         if time_s < self._strips[look.strip].final_to_s:
-            return "too late"
+            return TOO_LATE
         if (name, look.strip) in self._done:
             return "point is final"
         if name in self.points and look in self.points[name].looks:

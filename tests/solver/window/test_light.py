@@ -195,6 +195,11 @@ DRIFT = BiasedSource("matcher-2", "B", 0.0, 0.5, 0.0, 0.02, 60.0, 36.0, 10.0)
         ({"ground_protection_m": NONE}, WEAK, "not known yet"),
         ({"tied": 1}, WEAK, "too few tie points within 40 s: 1 are seen twice, wanted 6"),
         ({"tied": 1, "length_s": 0.0}, WEAK, "too few tie points yet: 1 are seen twice, wanted 6"),
+        ({"tied": 1, "late": 0.2}, WEAK, "within 40 s: 1 are seen twice, wanted 6"),
+        (
+            {"tied": 1, "late": 0.4}, WEAK,
+            "wanted 6; 40 % of the looks came when the window had passed them: is it shorter than from one view to",
+        ),
         ({"trajectory": (2.5, 1.0, 1.9)}, WEAK, "the trajectory is worse than stated: offset 2.5 times"),
     ],
 )  # fmt: skip

@@ -364,6 +364,14 @@ def test_what_is_final_stays_final(flight):
     assert len(window.state) == 0
 
 
+def test_a_window_that_is_shorter_than_from_view_to_view_is_named(flight, adjusted):
+    """Without a point that is seen twice the light said how many are wanted, not why there are none."""
+    short = adjust_online(*flight, WindowOptions(window_s=3.0), live=False, update_s=1.0)
+    why = "of the looks came when the window had passed them: is it shorter than from one view to the next?"
+    assert any(why in report.quality.reason for report in short.reports)
+    assert not any("had passed" in report.quality.reason for report in adjusted.reports)
+
+
 def test_control_that_comes_late_still_counts(flight):
     simulation, poses = flight
     names = [str(simulation.points.id[i]) for i in np.flatnonzero(simulation.points.role == "control")]
