@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ...solver.matching.line_quality import FULL_SCALES
 from ...solver.orthoimage.seams import feather_weights, label_cost, seam_labels, seam_lines
-from ...solver.orthoimage.tone_balance import ToneBalance, ToneSamples, balance
+from ...solver.orthoimage.tone_balance import ToneBalance, ToneSamples, balance, held_out
 from ...solver.rectification.grid import transformer_to
 from ..errors import UserError
 from ..formats.geojson import write_line_features
@@ -43,6 +43,9 @@ Key = tuple[int, int]
 
 #: Cells a side of the nodes that seams go between, and nodes beyond its border that a tile sees.
 NODE, BEYOND = 4, 16
+#: Layers are left as they are where places that the balance was not computed from agree less than so many times as well
+#: with it. Tuned: what does no harm to see is kept, so that its gains and sigmas are told.
+WORTH = 0.95
 #: Cells a side of the places whose mean grey values are balanced, and how many a tile gives at most.
 PLACE, MOST_PLACES = 16, 200
 #: Places a side of the parts of a tile whose errors are taken to be alike in the sigmas of the balance.
@@ -287,25 +290,43 @@ def write_balance(folder: Path, layers: list[Layer], several: list[Key], setting
     rough = np.concatenate([p["rough"] for _, p in parts] or [np.ones(0)])
     # of a mean absolute difference; a whole grey value keeps it from nothing
     usual = max(0.8 * float(np.median(rough)), 0.5 if layers[0].dtype[0] in "iu" else 1e-12) if len(rough) else 1.0
-    bands = []
-    for band in range(layers[0].bands):
-        places, first = [], 0
-        group = []
-        for number, p in parts:
-            places.append(p["place"] + first)
-            first += len(p["rough"])
-            group.append(number * (settings.tile // PLACE) ** 2 + p["part"])
-        if settings.balance == "none" or not first:
-            result = ToneBalance.none(camera)
-        else:
-            samples = ToneSamples(
-                np.concatenate(places), np.concatenate([p["layer"] for _, p in parts]),
-                np.concatenate([p["value"][:, band] for _, p in parts]),
-                np.concatenate([p["off_middle"] for _, p in parts]), np.concatenate(group),
-            )  # fmt: skip
-            result = balance(samples, camera, fall_off)
-        bands.append({k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(result).items()})
-    write_json(folder / "balance.json", {"cameras": cameras, "usual_difference": usual, "bands": bands})
+    samples, worth = [], None
+    if settings.balance != "none" and len(rough):
+        samples = [_samples(parts, band, settings.tile) for band in range(layers[0].bands)]
+        worth = float(np.exp(np.mean([np.log(held_out(s, camera, fall_off)) for s in samples])))
+    if worth is None or worth < WORTH:
+        results = [ToneBalance.none(camera)] * layers[0].bands
+    else:
+        results = [balance(s, camera, fall_off) for s in samples]
+    bands = [{k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(r).items()} for r in results]
+    told = {"cameras": cameras, "usual_difference": usual, "bands": bands, "places": len(rough), "worth": worth}
+    write_json(folder / "balance.json", told)
+
+
+def _samples(parts: list[tuple[int, dict[str, Any]]], band: int, tile: int) -> ToneSamples:
+    """What the tiles measured in a band, by their numbers."""
+    places, group, first = [], [], 0
+    for number, p in parts:
+        places.append(p["place"] + first)
+        first += len(p["rough"])
+        group.append(number * (tile // PLACE) ** 2 + p["part"])
+    return ToneSamples(
+        np.concatenate(places), np.concatenate([p["layer"] for _, p in parts]),
+        np.concatenate([p["value"][:, band] for _, p in parts]),
+        np.concatenate([p["off_middle"] for _, p in parts]), np.concatenate(group),
+    )  # fmt: skip
+
+
+def balance_left_out(folder: Path) -> str:
+    """Why layers have the tone that they came with although a balance was asked for; "" if they are balanced."""
+    found = read_json(folder / "balance.json")
+    worth = found.get("worth")
+    if worth is None or worth >= WORTH:
+        return ""
+    return (
+        f"one that is computed from half of the {found['places']} places makes the others agree {1 / worth:.1f} times "
+        "worse: too few places, or layers that do not show the same ground"
+    )
 
 
 def read_balance(folder: Path) -> tuple[list[ToneBalance], float]:

@@ -21,6 +21,7 @@ from ..batch.block_mosaic import (
     SEAMS,
     MosaicSettings,
     Outputs,
+    balance_left_out,
     check_layers,
     empty_layers,
     layers_in,
@@ -495,7 +496,8 @@ def _result(
         **{name: path and str(path) for name, path in _assets(outputs).items()},
         "stac": args.stac and str(args.stac), "empty": empty_layers(folder),
         "crs": settings.crs or "local", "gsd": settings.gsd, "rows": done["rows"], "columns": done["columns"],
-        "tile": settings.tile, "balance": settings.balance, "seams_by": settings.seams, "feather": settings.feather,
+        "tile": settings.tile, "balance": settings.balance, "balance_left_out": balance_left_out(folder),
+        "seams_by": settings.seams, "feather": settings.feather,
         "cameras": cameras, "usual_difference": usual,
         "layers": [
             {"name": layer.name, "cells": cells, **layer.told}
@@ -513,17 +515,20 @@ def tell(result: dict[str, Any], quiet: bool) -> None:
     print(f"{result['mosaic']}: {cells} in {result['crs']}, {layers}, {result['seconds']:.1f} s{again}")
     band = result["bands"][0]
     width = max(len(layer["name"]) for layer in result["layers"])
-    print(f"  {'layer':{width}}  {'cells shown':>12}" + ("" if result["balance"] == "none" else "  gain, offset"))
+    balanced = result["balance"] != "none" and not result["balance_left_out"]
+    print(f"  {'layer':{width}}  {'cells shown':>12}" + ("  gain, offset" if balanced else ""))
     for layer, tone in zip(result["layers"], band["layers"], strict=True):
         text = f"  {layer['name']:{width}}  {layer['cells']:12d}"
-        if result["balance"] != "none":
+        if balanced:
             text += (
                 f"  {tone['gain']:.4f} +- {tone['gain_sigma']:.4f}, {tone['offset']:+.1f} +- {tone['offset_sigma']:.1f}"
                 if tone["tied"]
                 else "  overlaps with no other"
             )
         print(text)
-    if result["balance"] == "fall-off":
+    if result["balance_left_out"]:
+        print(f"  no balance: {result['balance_left_out']}")
+    if balanced and result["balance"] == "fall-off":
         for camera in band["fall_off"]:
             if camera["camera"]:
                 end, ends = 1.0 + camera["s2"] + camera["s4"], "at the ends of the line"
@@ -534,11 +539,16 @@ def tell(result: dict[str, Any], quiet: bool) -> None:
             "grey values" + (" (first band)" if len(result["bands"]) > 1 else "")
         )
     step = result["step_across_seams"]
-    if step["nodes"]:
+    if step["nodes"] and band["places"]:
         print(
             f"  step of tone across {result['seam_lines']} seam lines: {step['raw_tone_rms']:.2f} grey values before, "
             f"{step['balanced_tone_rms']:.2f} after the balance (RMS of the lines; of single nodes "
             f"{step['raw_rms']:.2f} and {step['balanced_rms']:.2f})"
+        )
+    elif step["nodes"]:
+        print(
+            f"  step of tone across {result['seam_lines']} seam lines: {step['raw_tone_rms']:.2f} grey values "
+            f"(RMS of the lines; of single nodes {step['raw_rms']:.2f})"
         )
     by = Counter(layer["orientation"] for layer in result["layers"] if "orientation" in layer)
     if by:

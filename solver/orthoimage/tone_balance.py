@@ -205,6 +205,53 @@ def balance(samples: ToneSamples, camera: IntArray, fall_off: Mask) -> ToneBalan
     )  # fmt: skip
 
 
+def held_out(samples: ToneSamples, camera: IntArray, fall_off: Mask) -> float:
+    """How much better places agree with a balance that they are no part of, times as well as without any.
+
+    Places of every second group are balanced by those of the others, and the other way round. Where orthoimages show
+    what they have in common the value is large; it is below 1 where a balance would do harm: of too few places, or of
+    pictures that do not show the same ground.
+
+    Parameters
+    ----------
+    samples, camera, fall_off : as for `balance`
+    """
+    group = np.unique(samples.group, return_inverse=True)[1]
+    if group.max(initial=0) == 0:  # neighbours stay together
+        group = np.arange(len(group)) * 4 // max(len(group), 1)
+    K = len(group)
+    raw, balanced = np.zeros(K), np.zeros(K)
+    for half in (0, 1):
+        out = group % 2 == half
+        if out.all() or not out.any():
+            continue
+        found = balance(_of_places(samples, ~out), camera, fall_off)
+        layers = samples.layer
+        toned = np.empty(len(layers))
+        for layer in np.unique(layers).tolist():
+            of = layers == layer
+            toned[of] = found.radiance(layer, samples.value[of], samples.off_middle[of])
+        raw[out], balanced[out] = (_misfit(samples.place, v, K)[out] for v in (samples.value, toned))
+    finest = FINEST * max(float(np.median(samples.value)), 1.0)
+    return max(float(np.median(raw)), finest) / max(float(np.median(balanced)), finest)
+
+
+def _of_places(samples: ToneSamples, chosen: Mask) -> ToneSamples:
+    """The samples of some of the places."""
+    of = chosen[samples.place]
+    number = np.cumsum(chosen) - 1
+    return ToneSamples(
+        number[samples.place[of]], samples.layer[of], samples.value[of], samples.off_middle[of], samples.group[chosen]
+    )
+
+
+def _misfit(place: IntArray, value: Array, places: int) -> Array:
+    """By how much the values of each place (K,) differ from their mean."""
+    seen = np.maximum(np.bincount(place, minlength=places), 1)
+    mean = np.bincount(place, value, places) / seen
+    return np.sqrt(np.bincount(place, (value - mean[place]) ** 2, places) / np.maximum(seen - 1, 1))
+
+
 def _prior(m: int, fall_off: Mask, level: float) -> tuple[Array, Array]:
     """Information a priori and the values that it holds: datum, and what keeps unknowns without overlap finite."""
     k = len(fall_off)

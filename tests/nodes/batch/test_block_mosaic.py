@@ -134,6 +134,29 @@ def test_what_12_bits_saturate_says_nothing_of_tones(tmp_path, capsys):
     assert abs(other["gain"] / one["gain"] - 0.8) < 4.0 * sigma < 0.01
 
 
+def test_pictures_of_other_ground_are_left_as_they_are(tmp_path, capsys):
+    """Their balance made the step from one to the other larger, without a word."""
+    rng = np.random.default_rng(8)
+    inputs = []
+    for k, left in enumerate((0, 64)):
+        values = np.repeat(np.repeat(rng.uniform(300.0, 6000.0, (32, 32)), 16, axis=0), 16, axis=1)
+        inputs.append(tmp_path / f"ortho{k}.tif")
+        place = rasterio.Affine(GSD, 0, LEFT + left * GSD, 0, -GSD, TOP)
+        shape = {"driver": "GTiff", "height": 512, "width": 512, "count": 1, "dtype": "uint16", "crs": "EPSG:32632"}
+        with rasterio.open(inputs[-1], "w", transform=place, nodata=0, **shape) as target:
+            target.write(np.rint(values).astype(np.uint16)[None])
+    words = ["rectify", *map(str, inputs), "--mosaic", "--tile", "256", "--workers", "1", "-o"]
+    assert main([*words, str(tmp_path / "block.tif"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert "times worse: too few places, or layers that do not show the same ground" in told["balance_left_out"]
+    assert [layer["gain"] for layer in told["bands"][0]["layers"]] == [1.0, 1.0]
+    assert told["step_across_seams"]["balanced_rms"] == told["step_across_seams"]["raw_rms"] > 0
+    assert main([*words, str(tmp_path / "again.tif")]) == 0
+    said = capsys.readouterr().out
+    assert f"  no balance: {told['balance_left_out']}\n" in said
+    assert "gain, offset" not in said and "balance by" not in said and "after the balance" not in said
+
+
 @pytest.mark.parametrize("told", ["alpha", "mask"])
 def test_what_an_orthoimage_says_not_to_count_is_no_part_of_the_mosaic(told, tmp_path, capsys):
     """Alpha of 255 was taken for saturated, so that nothing was balanced; masks did not count."""

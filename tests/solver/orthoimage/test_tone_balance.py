@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from triline.solver.orthoimage.tone_balance import ToneBalance, ToneSamples, balance
+from triline.solver.orthoimage.tone_balance import ToneBalance, ToneSamples, balance, held_out
 
 
 def _drawn(seed: int, fall_off: tuple[float, float], moved: float = 0.05, layers: int = 5, places: int = 600):
@@ -59,6 +61,18 @@ def test_radiance_undoes_what_was_put_in():
     np.testing.assert_allclose(found.radiance(2, seen, s), 500.0, atol=8.0)
     none = ToneBalance.none(np.zeros(5, dtype=int))
     np.testing.assert_array_equal(none.radiance(1, np.array([7.0, 9.0]), np.array([0.5, 1.0])), [7.0, 9.0])
+
+
+@pytest.mark.parametrize("fall_off", [False, True])
+def test_places_that_a_balance_was_not_computed_from_say_what_it_is_worth(fall_off):
+    """A balance by places of other ground made steps of tone larger."""
+    camera, estimated = np.zeros(5, dtype=int), np.array([fall_off])
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        samples, _, _ = _drawn(seed, (0.0, 0.0), places=400)
+        assert held_out(samples, camera, estimated) > 4.0
+        other = replace(samples, value=rng.uniform(200.0, 900.0, len(samples.value)))
+        assert held_out(other, camera, estimated) < 1.0
 
 
 def test_no_overlap_is_refused():
