@@ -141,8 +141,17 @@ def read(room: str, path: str, text: str) -> Iterator[Constant]:
         pairs = list(_assigned(target, node.value))
         for name, value in pairs:
             if CAPITALS.fullmatch(name) and _is_number(value):
-                text_of = ast.get_source_segment(text, value) or ast.unparse(value)
-                yield Constant(room, path, name, " ".join(text_of.split()), comment, len(pairs) > 1, _refers(value))
+                text_of = " ".join(_segment(lines, value).split())
+                yield Constant(room, path, name, text_of, comment, len(pairs) > 1, _refers(value))
+
+
+def _segment(lines: Sequence[str], node: ast.expr) -> str:
+    """The source of an expression, as `ast.get_source_segment`, which splits the whole module anew for each."""
+    last = node.end_lineno or node.lineno
+    chosen = [line.encode() for line in lines[node.lineno - 1 : last]]
+    chosen[-1] = chosen[-1][: node.end_col_offset]
+    chosen[0] = chosen[0][node.col_offset :]
+    return b"\n".join(chosen).decode()
 
 
 def _comment_above(lines: Sequence[str], lineno: int) -> str:

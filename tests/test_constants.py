@@ -20,26 +20,31 @@ def constants():
         sys.path.remove(str(BENCH))
 
 
-def test_the_page_is_up_to_date(constants):
-    fresh = constants.page_with(constants.tables(constants.constants()))
+@pytest.fixture(scope="module")
+def among(constants):
+    """All constants, read once."""
+    return tuple(constants.constants())
+
+
+def test_the_page_is_up_to_date(constants, among):
+    fresh = constants.page_with(constants.tables(among))
     assert constants.PAGE.read_text(encoding="utf-8") == fresh, "run: python bench/constants.py table"
 
 
-def test_every_constant_is_found_by_the_name_in_the_table(constants):
-    among = constants.constants()
-    assert constants.chosen([constants.label(c, among) for c in among], among) == among
+def test_every_constant_is_found_by_the_name_in_the_table(constants, among):
+    assert constants.chosen([constants.label(c, among) for c in among], among) == list(among)
 
 
-def test_constants_of_navigation_and_matching_say_what_they_are(constants):
-    silent = [f"{c.path}: {c.name}" for c in constants.constants() if c.room != "window" and not c.comment]
+def test_constants_of_navigation_and_matching_say_what_they_are(among):
+    silent = [f"{c.path}: {c.name}" for c in among if c.room != "window" and not c.comment]
     assert not silent
 
 
-def test_a_name_that_several_have_needs_its_module(constants):
+def test_a_name_that_several_have_needs_its_module(constants, among):
     with pytest.raises(LookupError, match=r"KEPT_S is one of .*current_orientation\.KEPT_S"):
-        constants.chosen(["KEPT_S"], constants.constants())
+        constants.chosen(["KEPT_S"], among)
     with pytest.raises(LookupError, match="no constant NONE_SUCH"):
-        constants.chosen(["NONE_SUCH"], constants.constants())
+        constants.chosen(["NONE_SUCH"], among)
 
 
 SOURCE = """
