@@ -161,7 +161,7 @@ def oriented(tmp_path_factory):
     """A flight in UTM, processed, with a boresight, and the CSV of its lines."""
     folder = tmp_path_factory.mktemp("oriented")
     words = ["--seconds", "6", "--ties", "12", "--attitude-rate", "100", "--lead-in", "2", "--sensor", "ads40-small"]
-    assert main(["simulate", "-o", str(folder / "flight.mcap"), "-q", "--strips", "2", *words]) == 0
+    assert main(["simulate", "-o", str(folder / "flight.mcap"), "-q", "--strips", "2", "--no-turns", *words]) == 0
     assert main(["process", str(folder / "flight.mcap"), "-o", str(folder / "oriented.mcap"), "-q"]) == 0
     assert main(["export", str(folder / "oriented.mcap"), "--per-line", str(folder / "lines.csv"), "-q"]) == 0
     return folder / "oriented.mcap", pd.read_csv(folder / "lines.csv")
