@@ -69,7 +69,7 @@ def test_a_single_look_counts_when_another_strip_sees_its_point(online):
 def test_points_of_single_looks_lie_where_the_looks_meet(monkeypatch):
     """Nadir looks alone, which are first thought to meet the ground 100 m too high; the camera has parameters, so rays
     are fitted to their points, and the attitude changes fast between the two places."""
-    simulation, poses = unsteady = flown(replace(PLAN, strips=1, stabilised=False))
+    simulation, poses = unsteady = flown(replace(PLAN, strips=1, strip_s=16.0, stabilised=False))
     nadir = simulation.images.looks.ccd == simulation.flight.camera.line_index["N"]
     unsteady = replace(simulation, images=simulation.images.select(nadir)), poses
     make, open_ = BatchMaker.make_single, left_by_calibration(simulation.flight.camera)
@@ -111,7 +111,7 @@ def test_a_camera_with_one_ccd_line_has_a_window_of_its_own_and_loses_no_ties():
 def test_one_ccd_line_without_control_ties_its_strips(monkeypatch):
     """Nobody says where the ground is, 700 m nearer than looks are linearised at first: none of them tied anything."""
     monkeypatch.setattr(leaving, "NOBODY_KNOWS_M", 2200.0)
-    simulation, poses = flown(replace(PLAN, camera=nadir_alone()), replace(TIES, control=0))
+    simulation, poses = flown(replace(PLAN, camera=nadir_alone(), strip_s=16.0), replace(TIES, control=0))
     online = adjust_online(simulation, poses, replace(OPTIONS, snoop=True), live=False, update_s=1.0)
     batch = adjust_at_once(simulation, poses, OPTIONS)
     ties = {name: p for name, p in batch.final_points.items() if p.rays > 1}

@@ -317,7 +317,7 @@ def test_the_variance_of_two_looks_is_that_of_the_good_ones(sigma, spoilt):
     assert np.percentile(found, 2) > 0.3 and np.percentile(found, 98) < 2.4
 
 
-@pytest.mark.parametrize("seed", [2, 7])
+@pytest.mark.parametrize("seed", [pytest.param(2, marks=pytest.mark.study), 7])
 def test_gross_errors_of_a_strip_that_begins_are_not_taken_for_sigmas(seed):
     """Its points have two looks at first, of which none can be spared. Sigmas of the image became twenty times as
     large, tests of single looks as much wider, and the orientation was twice as bad to the end of the strip."""
