@@ -41,7 +41,10 @@ def flown():
     simulation = simulate_with_camera_errors(
         PLAN, SEED, STATED, ErrorModel(attitude_rate_hz=100.0), ObservationPlan(tie_points_per_s=8.0, check=5)
     )
-    navigator, adjuster = Navigator(), Adjuster(grid_hz=5.0, self_calibration="tls18", camera_sigma=0.1)
+    navigator, adjuster = (
+        Navigator(),
+        Adjuster(grid_hz=5.0, self_calibration="tls18", camera_sigma=0.1, update_s=0.3, update_rays=1000),
+    )
     messages, kept = [], []
     for message in Simulator(simulation).messages(EPOCH):
         messages.append(message)
