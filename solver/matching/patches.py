@@ -16,6 +16,8 @@ Between = tuple[NDArray[np.int64], tuple[Float32, ...]]
 
 #: A value counts as measured if no more of it comes from pixels that were not: a bicubic value has less of them.
 MOST_HOLE = 0.1
+#: NumPy adds so many values in a row, and more, in another order than one after the other. Definition.
+SUMMED_IN_PAIRS = 8
 #: Saturated and dead pixels get the mean of those within so many pixels.
 MENDED_PX = 2
 
@@ -47,7 +49,7 @@ class Windows:
             return self
         k = len(self.values)
         n, m = (size // factor * factor for size in self.values.shape[1:])
-        values = self.values[:, :n, :m].reshape(k, n // factor, factor, m // factor, factor).mean(axis=(2, 4))
+        values = _means(self.values[:, :n, :m], factor)
         lines = self.lines_known[:, :n].reshape(k, -1, factor).min(axis=2)
         samples = self.samples_known[:, :m].reshape(k, -1, factor).min(axis=2)
         filled = self.lines_filled[:, :n].reshape(k, -1, factor).max(axis=2)
@@ -104,6 +106,35 @@ class Windows:
         off, wide = 0.5 * (self.factor - 1), (len(self.values),) + (1,) * (line.ndim - 1)
         u = (line - self.first_line.reshape(wide) - off) / self.factor
         return u, (sample - self.first_sample.reshape(wide) - off) / self.factor
+
+
+def _means(values: Float32, factor: int) -> Float32:
+    """Means of blocks of ``factor`` x ``factor`` of (k, n, m).
+
+    For small blocks as NumPy adds them, to the last bit, but over all blocks at once.
+    """
+    k, n, m = values.shape
+    if factor >= SUMMED_IN_PAIRS or values.dtype.kind != "f":
+        return values.reshape(k, n // factor, factor, m // factor, factor).mean(axis=(2, 4))
+    total = np.zeros((k, n // factor, m // factor), dtype=values.dtype)
+    for a in range(factor):
+        row = values[:, a::factor, ::factor].copy()
+        for b in range(1, factor):
+            row += values[:, a::factor, b::factor]
+        total += row
+    total /= values.dtype.type(factor * factor)
+    return total
+
+
+def any_of(mask: Mask, factor: int) -> Mask:
+    """Whether any of each block of ``factor`` x ``factor`` of (k, n, m) is set; without what makes no whole block."""
+    n, m = (size // factor * factor for size in mask.shape[1:])
+    whole = mask[:, :n, :m]
+    found = whole[:, ::factor, ::factor].copy()
+    for a in range(factor):
+        for b in range(factor):
+            found |= whole[:, a::factor, b::factor]
+    return found
 
 
 def holes_at(holes: Mask, y: Array, x: Array) -> Float32:

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .patches import Windows
+from .patches import Windows, any_of
 from .search import Ground, Patches
 
 Array = NDArray[np.floating]
@@ -155,7 +155,7 @@ class ScenePatches:
         none = windows.values <= 0.0  # no data; single pixels of 0 and saturated ones are mended
         windows = windows.reduced(reduce)
         values, known = windows.sample(at[:, 0], at[:, 1], cubic=factor == 1)
-        good = known & ~windows.touched(_any(none, reduce), at[:, 0], at[:, 1]) if none.any() else known
+        good = known & ~windows.touched(any_of(none, reduce), at[:, 0], at[:, 1]) if none.any() else known
         if factor > 1:  # `find` takes holes of full-size patches alone
             known = good
         # beside what has no data, large edges would correlate with anything
@@ -163,7 +163,7 @@ class ScenePatches:
         values = np.where(good, values, mean[:, None, None].astype(np.float32))
         touched = ~good
         if holes is not None and factor == 1:
-            touched |= windows.touched(_any(holes, reduce), at[:, 0], at[:, 1])
+            touched |= windows.touched(any_of(holes, reduce), at[:, 0], at[:, 1])
         return Patches(values, known.reshape(k, -1).mean(axis=1), np.zeros(k), touched if touched.any() else None)
 
     def _windows(self, at: Array, reduce: int) -> Windows:
@@ -179,10 +179,3 @@ class ScenePatches:
             for k, length in enumerate((lines, samples))
         ]
         return Windows(first[:, 0], first[:, 1], values, known[0], known[1], np.zeros((len(values), lines), dtype=bool))
-
-
-def _any(holes: NDArray[np.bool_], reduce: int) -> NDArray[np.bool_]:
-    """Blocks of holes (k, n, m) that have one."""
-    k, rows, columns = len(holes), holes.shape[1] // reduce, holes.shape[2] // reduce
-    blocks = holes[:, : rows * reduce, : columns * reduce].reshape(k, rows, reduce, columns, reduce)
-    return np.asarray(blocks.any(axis=(2, 4)))

@@ -13,7 +13,7 @@ from triline.solver.geometry.rotation import (
 from triline.solver.matching import least_squares
 from triline.solver.matching.chips import CHIP_BYTES, CHIP_HALF, ChipStore
 from triline.solver.matching.least_squares import match_patches
-from triline.solver.matching.patches import Windows, interpolate_stack
+from triline.solver.matching.patches import Windows, any_of, interpolate_stack
 from triline.solver.matching.pose_smoothing import PoseSmoother
 from triline.solver.matching.search import Ground
 
@@ -194,3 +194,18 @@ def test_what_was_not_measured_does_not_matter_whatever_its_grey_values():
     # without the holes the same patches are spoilt
     blind = match_patches(spoilt, between.astype(np.float32), np.zeros((k, 2)))
     assert np.abs(blind.shift - shift).mean() > 2 * np.abs(error).mean()
+
+
+@pytest.mark.parametrize("factor", range(1, 10))
+def test_pixels_that_are_put_together_are_the_mean_and_any_of_their_block(factor):
+    """To the last bit as NumPy adds them, which is slow for small blocks; what makes no whole block is left out."""
+    rng = np.random.default_rng(factor)
+    values, (k, n, m) = rng.normal(900.0, 300.0, (5, 47, 53)).astype(np.float32), (5, 47 // factor, 53 // factor)
+    there = [np.ones((k, size), dtype=bool) for size in values.shape[1:]]
+    none = np.zeros(k, dtype=np.int64)
+    of = lambda a: a[:, : n * factor, : m * factor].reshape(k, n, factor, m, factor)  # noqa: E731
+    reduced = Windows(none, none, values, *there, ~there[0]).reduced(factor)
+    np.testing.assert_array_equal(reduced.values, of(values).mean(axis=(2, 4)))
+    assert reduced.values.dtype == np.float32 and reduced.factor == factor
+    holes = values > 1800.0
+    np.testing.assert_array_equal(any_of(holes, factor), of(holes).any(axis=(2, 4)))
