@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import rasterio
 from scipy.ndimage import gaussian_filter
+from scipy.signal import correlate
 
 from triline.nodes.cli import main
 
@@ -54,11 +55,10 @@ def matches(left: Path, right: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _peak(patch: np.ndarray, area: np.ndarray) -> tuple[float, float] | None:
-    windows = np.lib.stride_tricks.sliding_window_view(area, patch.shape)
-    a = patch - patch.mean()
-    b = windows - windows.mean(axis=(2, 3), keepdims=True)
-    norm = np.sqrt((a * a).sum() * (b * b).sum(axis=(2, 3)))
-    score = (b * a).sum(axis=(2, 3)) / np.where(norm > 0, norm, 1.0)
+    a, b = patch - patch.mean(), area - area.mean()
+    variance = _sums(b * b, len(a)) - _sums(b, len(a)) ** 2 / a.size
+    norm = np.sqrt((a * a).sum() * np.maximum(variance, 0.0))
+    score = correlate(b, a, mode="valid", method="fft") / np.where(norm > 0, norm, 1.0)
     i, j = np.unravel_index(np.argmax(score), score.shape)
     if score[i, j] < LEAST or not (0 < i < score.shape[0] - 1 and 0 < j < score.shape[1] - 1):
         return None
@@ -67,6 +67,13 @@ def _peak(patch: np.ndarray, area: np.ndarray) -> tuple[float, float] | None:
         left, middle, right = line[k - 1 : k + 2]
         sub.append(k - SEARCH + 0.5 * (left - right) / (left - 2 * middle + right))
     return sub[0], sub[1]
+
+
+def _sums(values: np.ndarray, side: int) -> np.ndarray:
+    """Sums over all squares of so many cells a side."""
+    total = np.zeros((values.shape[0] + 1, values.shape[1] + 1))
+    total[1:, 1:] = values.cumsum(axis=0).cumsum(axis=1)
+    return total[side:, side:] - total[:-side, side:] - total[side:, :-side] + total[:-side, :-side]
 
 
 def offsets_px(folder: Path, out: Path) -> tuple[np.ndarray, np.ndarray]:
