@@ -71,7 +71,9 @@ class View:
         h = np.full(len(pixel), 240.0)
         for _ in range(40):
             lat, lon, _ = self.direct(*pixel.T, h).T
-            h = relief(*((np.stack([lon, lat]) - [[LON], [LAT]]) * METRES[:, None]))
+            before, h = h, relief(*((np.stack([lon, lat]) - [[LON], [LAT]]) * METRES[:, None]))
+            if np.abs(h - before).max() < 1e-9:
+                break
         return self.direct(*pixel.T, h)
 
     def picture(self, texture: GroundTexture, rng: np.random.Generator, noise: float = 8.0) -> np.ndarray:
