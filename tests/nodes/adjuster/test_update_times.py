@@ -16,7 +16,7 @@ EPOCH = 1_700_000_000_000_000_000
 #: Of attitudes, and so of poses.
 RATE_HZ = 200.0
 #: Tie points are handed over from then on, s: a short time of a full flow of them is enough.
-TIES_FROM_S = 10.3
+TIES_FROM_S = 11.3
 
 
 def flown(ties_per_s):

@@ -62,7 +62,7 @@ def found_from(master, other, wrong_px):
     return find(master, line, ground, other, np.full((PLACES, 2), wrong_px), line, 6.0)
 
 
-@pytest.mark.parametrize("wrong_px", [0.25, -0.25, 0.4, 1.3])
+@pytest.mark.parametrize("wrong_px", [0.4, 1.3, *(pytest.param(px, marks=pytest.mark.study) for px in (0.25, -0.25))])
 def test_a_prediction_wrong_by_a_part_of_a_pixel_does_not_move_the_match(wrong_px):
     here = views(25.0, 0.15)
     right, wrong = (found_from(*here, px) for px in (0.0, wrong_px))
@@ -73,7 +73,7 @@ def test_a_prediction_wrong_by_a_part_of_a_pixel_does_not_move_the_match(wrong_p
     assert np.abs((wrong.shift - right.shift)[good].mean(axis=0)).max() < 0.005
 
 
-@pytest.mark.parametrize("noise", [20.0, 40.0, 60.0])
+@pytest.mark.parametrize("noise", [20.0, pytest.param(40.0, marks=pytest.mark.study), 60.0])
 def test_the_covariance_holds_for_weak_and_strong_noise(noise):
     found = found_from(*views(noise, 0.08), 0.3)
     good = found.reason == ""

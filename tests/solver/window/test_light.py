@@ -388,7 +388,7 @@ def test_protection_levels_are_those_of_the_present_equations():
 
     plan = FlightPlan(strip_s=40.0, lead_in_s=3.0, lead_out_s=2.0)
     simulation = simulate(plan, 11, SENSORS, ObservationPlan(tie_points_per_s=8.0, check=0))
-    adjust_online(simulation, navigate(simulation), WindowOptions(grid_hz=2.0), watch=watch, update_s=0.5, live=False)
+    adjust_online(simulation, navigate(simulation), WindowOptions(grid_hz=2.0), watch=watch, update_s=1.0, live=False)
     ratios = np.array(found)
     assert len(ratios) > 20
     assert (ratios > 0.8).mean() > 0.95 and np.median(ratios) < 1.3
