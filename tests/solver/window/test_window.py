@@ -226,7 +226,7 @@ def test_without_any_tie_point_the_measured_trajectory_comes_back_with_its_sigma
     assert np.isnan(result.reports[-1].sigma0)
 
 
-@pytest.mark.parametrize("seeds", [2, pytest.param(8, marks=pytest.mark.study)])
+@pytest.mark.parametrize("seeds", [1, pytest.param(8, marks=pytest.mark.study)])
 def test_outliers_are_found_and_the_result_is_as_good_as_without_them(seeds):
     """20 % of the rays are blunders. What is compared is the same flight with those rays never measured."""
     plan = replace(TIES, tie_points_per_s=8.0)
