@@ -111,7 +111,7 @@ class Windows:
 def _means(values: Float32, factor: int) -> Float32:
     """Means of blocks of ``factor`` x ``factor`` of (k, n, m).
 
-    For small blocks as NumPy adds them, to the last bit, but over all blocks at once.
+    For small blocks in the order in which NumPy adds them, but over all blocks at once.
     """
     k, n, m = values.shape
     if factor >= SUMMED_IN_PAIRS or values.dtype.kind != "f":
