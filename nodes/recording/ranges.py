@@ -71,8 +71,11 @@ class Ranged:
         index = self.index
         wanted = numbers[index.sequence[numbers] == UNKNOWN]
         packed = self._packed[index.chunk[wanted]]
-        for row in wanted[packed].tolist():
-            self._note(row, self.content(int(index.chunk[row])), int(index.place[row]))
+        rows = wanted[packed]
+        for number in np.unique(index.chunk[rows]).tolist():
+            content = self.content(number)  # once for all of its messages
+            for row in rows[index.chunk[rows] == number].tolist():
+                self._note(row, content, int(index.place[row]))
         rows = wanted[~packed]
         if not len(rows):
             return
