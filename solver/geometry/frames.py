@@ -191,10 +191,13 @@ class LocalFrame:
             if np.ptp(xyz[:, 0]) > 0.5 * circle:  # on both sides of the date line
                 xyz[:, 0] %= circle
         x, y, z = np.mean(xyz, axis=0)
-        lon, lat, _ = _transformer(parsed).transform(x, y, z)
+        to_wgs84 = _transformer(parsed)
+        lon, lat, _ = to_wgs84.transform(x, y, z)
         if not np.isfinite([lon, lat]).all():
             raise CrsError(f"coordinates outside the area of {crs!r}")
-        return cls(round(float(lat), 6), round(float((lon + 180.0) % 360.0 - 180.0), 6), 0.0, crs)
+        frame = cls(round(float(lat), 6), round(float((lon + 180.0) % 360.0 - 180.0), 6), 0.0, crs)
+        frame.__dict__["_to_wgs84"] = to_wgs84  # PROJ takes a fifth of a second to look for one with a geoid
+        return frame
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import erfa
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .time_scales import iso_utc, julian_dates, tai_from_day
+from .time_scales import iso_utc, julian_dates, leap_seconds, tai_from_day
 
 Array = NDArray[np.floating]
 
@@ -79,8 +79,9 @@ class EarthOrientation:
 
     def __init__(self, table: EarthOrientationTable, reference_ns: int):
         self.table, self.reference_ns = table, int(reference_ns)
-        leap = np.array([_tai_minus_utc(day) for day in table.mjd])
-        self._ut1_tai = np.asarray(table.ut1_utc_s, dtype=float) - leap
+        # to the nanosecond, as instants are; a table has 20 000 days
+        leap_ns = np.round(leap_seconds(np.asarray(table.mjd).astype(np.int64)) * 1e9)
+        self._ut1_tai = np.asarray(table.ut1_utc_s, dtype=float) - leap_ns * 1e-9
 
     def R_ie(self, time_s: ArrayLike) -> Array:
         """Rotations (n, 3, 3) from ITRF to GCRS at times (n,) in seconds from the reference.
@@ -158,7 +159,3 @@ def _celestial_pole(day: float | Array, tt: Array) -> tuple[Array, Array, Array]
         return erfa.xys06a(day, tt)
     nodes = low + (np.arange(n) - _EXTRA_NODES) * _NODE_DAYS
     return tuple(make_interp_spline(nodes, np.stack(erfa.xys06a(first, nodes), axis=1), k=_DEGREE)(x).T)
-
-
-def _tai_minus_utc(mjd: float) -> float:
-    return (tai_from_day(int(mjd), 0, "UTC") - tai_from_day(int(mjd), 0, "TAI")) * 1e-9

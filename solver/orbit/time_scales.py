@@ -86,16 +86,16 @@ def tai_from_day(mjd: int, ns_of_day: int, scale: str = "UTC") -> int:
 def tai_from_unix(utc_ns: ArrayLike) -> NDArray[np.int64]:
     """``tai_ns`` (...) of time stamps (...): nanoseconds since the Unix epoch, UTC without leap seconds."""
     ns = np.asarray(utc_ns, dtype=np.int64)
-    leap = np.round(_leap_seconds(ns // _DAY + _UNIX_EPOCH_MJD) * _SECOND).astype(np.int64)
+    leap = np.round(leap_seconds(ns // _DAY + _UNIX_EPOCH_MJD) * _SECOND).astype(np.int64)
     return ns + leap
 
 
 def unix_from_tai(tai_ns: ArrayLike) -> NDArray[np.int64]:
     """Time stamps (nanoseconds since the Unix epoch, UTC) of instants."""
     tai = np.asarray(tai_ns, dtype=np.int64)
-    guess = tai - np.round(_leap_seconds(tai // _DAY + _UNIX_EPOCH_MJD) * _SECOND).astype(np.int64)
+    guess = tai - np.round(leap_seconds(tai // _DAY + _UNIX_EPOCH_MJD) * _SECOND).astype(np.int64)
     # close to a leap second the day of TAI is one day ahead of the day of UTC
-    return tai - np.round(_leap_seconds(guess // _DAY + _UNIX_EPOCH_MJD) * _SECOND).astype(np.int64)
+    return tai - np.round(leap_seconds(guess // _DAY + _UNIX_EPOCH_MJD) * _SECOND).astype(np.int64)
 
 
 def iso_utc(tai_ns: int, digits: int = 3) -> str:
@@ -121,10 +121,10 @@ def julian_dates(reference_ns: int, time_s: ArrayLike, scale: str = "TT") -> tup
 @lru_cache(maxsize=1024)
 def _leap_ns(mjd_utc: int) -> int:
     """TAI minus UTC, nanoseconds, at the midnight that begins a day of UTC: the same for all lines of a scene."""
-    return round(float(_leap_seconds(np.array([mjd_utc]))[0]) * _SECOND)
+    return round(float(leap_seconds(np.array([mjd_utc]))[0]) * _SECOND)
 
 
-def _leap_seconds(mjd_utc: NDArray[np.int64]) -> NDArray[np.floating]:
+def leap_seconds(mjd_utc: NDArray[np.int64]) -> NDArray[np.floating]:
     """TAI minus UTC, seconds, at the midnights that begin these days of UTC."""
     days, back = np.unique(np.asarray(mjd_utc), return_inverse=True)
     with warnings.catch_warnings():  # a year that ERFA calls dubious has the last known number of leap seconds
