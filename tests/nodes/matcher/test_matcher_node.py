@@ -45,6 +45,12 @@ def messages():
     return list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
 
 
+@pytest.fixture(scope="module")
+def short():
+    flight = simulated_flight({**SETTINGS, "seconds": 8.0, "lead_out": 2.0, "check": 2})
+    return list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
+
+
 def run(tmp_path, messages, points_per_s=4.0, **settings):
     """Process messages with navigator, matcher and adjuster; returns summary, ties and what was told."""
     flight, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
@@ -134,7 +140,7 @@ FAULTS = {
     ),
     "a CCD line falls silent": (
         backward_dies,
-        {"ties": 60},
+        {"ties": 30},  # of a flight of 8 s
         ("B: nothing has come after line 151",),
     ),
     "the nadir line dies": (
@@ -151,12 +157,15 @@ FAULTS = {
 
 
 @pytest.mark.parametrize(
-    "fault",
-    ["a CCD line falls silent", *(pytest.param(f, marks=pytest.mark.study) for f in list(FAULTS) if "silent" not in f)],
+    ("fault", "flight"),
+    [
+        ("a CCD line falls silent", "short"),
+        *(pytest.param(f, "messages", marks=pytest.mark.study) for f in list(FAULTS) if "silent" not in f),
+    ],
 )
-def test_bad_imagery_is_told_in_a_line_and_counted_and_the_adjustment_goes_on(tmp_path, messages, fault):
+def test_bad_imagery_is_told_in_a_line_and_counted_and_the_adjustment_goes_on(tmp_path, request, fault, flight):
     change, counters, words = FAULTS[fault]
-    summary, ties, told = run(tmp_path, spoilt(messages, change))
+    summary, ties, told = run(tmp_path, spoilt(request.getfixturevalue(flight), change))
     counted = summary.counters["matcher"]
     for name, least in counters.items():
         assert counted.get(name, 0) >= least, name
@@ -166,7 +175,7 @@ def test_bad_imagery_is_told_in_a_line_and_counted_and_the_adjustment_goes_on(tm
     assert all("\n" not in text for text in told)
     assert sum(": target " not in text for text in told) < 20 and not any("no lines" in text for text in told)
     assert len(ties) > 10 and counted["ties"] == len(ties)
-    assert summary.outputs["orientation/final"] > 180
+    assert summary.outputs["orientation/final"] > (120 if flight == "short" else 180)
 
 
 @pytest.mark.study
@@ -229,12 +238,6 @@ def test_what_the_adjuster_answers_is_no_progress():
         if x.topic == "observation/progress"
     ]
     assert told == ["trajectory/filtered", "sensor/lines/N"]
-
-
-@pytest.fixture(scope="module")
-def short():
-    flight = simulated_flight({**SETTINGS, "seconds": 8.0})
-    return list(Simulator(flight.simulation, flight.imager).messages(EPOCH_NS))
 
 
 def whole_orientation(out):
@@ -466,5 +469,5 @@ def test_a_camera_may_be_mounted_turned_and_oblique(tmp_path, short, alone):
     assert not summary.counters["matcher"].get("malformed") and not summary.counters["adjuster"].get("malformed")
     straight, expected = alone
     found = whole_orientation(tmp_path / "out.mcap")
-    assert len(ties) > 0.85 * len(straight) > 30
+    assert len(ties) > 0.85 * len(straight) > 25
     assert len(found) == len(expected) and np.abs(found - expected).max() < 0.3

@@ -35,22 +35,22 @@ KINDS = ("attitude", "inertial")
 
 @pytest.fixture(scope="module")
 def flights(tmp_path_factory):
-    return recorded(tmp_path_factory, 12.0)
+    return recorded(tmp_path_factory, 12.0, 50.0)
 
 
 @pytest.fixture(scope="module")
 def long_flights(tmp_path_factory):
-    return recorded(tmp_path_factory, 30.0)
+    return recorded(tmp_path_factory, 30.0, 100.0)
 
 
-def recorded(tmp_path_factory, strip_s):
-    """Recordings of a strip with its truth, by kind of navigation data."""
+def recorded(tmp_path_factory, strip_s, rate_hz):
+    """Recordings of a strip with its truth, by kind of navigation data, at a rate of attitudes and inertial samples."""
     found = {}
     for kind in KINDS:
-        inertial = InertialPlan(TACTICAL, 100.0) if kind == "inertial" else None
+        inertial = InertialPlan(TACTICAL, rate_hz) if kind == "inertial" else None
         # an inertial filter aligns first
         plan = FlightPlan(strip_s=strip_s, lead_in_s=20.0 if inertial else 3.0)
-        simulation = simulate(plan, 4, ErrorModel(attitude_rate_hz=100.0, gnss_rate_hz=5.0), inertial=inertial)
+        simulation = simulate(plan, 4, ErrorModel(attitude_rate_hz=rate_hz, gnss_rate_hz=5.0), inertial=inertial)
         path = tmp_path_factory.mktemp(kind) / "flight.mcap"
         with RecordingWriter(path) as writer:
             for message in Simulator(simulation).messages(EPOCH):
