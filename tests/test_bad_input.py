@@ -39,7 +39,7 @@ import numpy as np
 import pytest
 import sample_messages as sample
 import zenoh
-from bus_rig import TRILINE, Rig, simulated_flight, triline, wait_for, wait_for_nodes
+from bus_rig import TRILINE, Rig, here, simulated_flight, wait_for, wait_for_nodes
 
 from triline.nodes import convert
 from triline.nodes.adjuster.adjuster import Adjuster
@@ -179,7 +179,8 @@ def _doctored(recording: Path, path: Path, change: Change) -> Run:
                 number = numbers[raw.topic]  # below 0: the message before once more
                 writer.write_raw(out._replace(envelope=out.envelope._replace(sequence=number)))
     outputs: list[RawMessage] = []
-    nodes = [Navigator(), Adjuster(update_s=1.0, update_rays=1000)]  # when updates come is not asked for
+    # when updates come is not asked for, nor all of the 200 filtered poses a second
+    nodes = [Navigator(filtered_s=0.05), Adjuster(update_s=1.0, update_rays=1000)]
     summary = process(RecordingReader(path), nodes, outputs.append)
     assert not any("failed" in counters for counters in summary.counters.values()), summary.problems
     return Run(summary, outputs, start_ns)
@@ -201,7 +202,7 @@ def clean(fly) -> Run:
 
 def test_a_pose_before_its_velocity_is_known_is_not_valid(clean):
     t, _, valid, reasons = clean.poses("trajectory/filtered")
-    assert not valid[t < 0.15].any() and "sigma" in reasons[5]
+    assert not valid[t < 0.15].any() and "sigma" in reasons[1]
     assert valid[t > 1.0].all()
 
 
@@ -285,7 +286,7 @@ def test_positions_two_seconds_out_of_order(fly, clean):
 
     mixed = fly("late", late)
     assert mixed.summary.counters["navigator"] == {"gnss late": 1, "gnss too late": 1}
-    assert mixed.poses("trajectory/filtered")[2][200:].all()
+    assert mixed.poses("trajectory/filtered")[2][20:].all()
     np.testing.assert_allclose(
         mixed.errors("orientation/final", 10.1, 21.9), clean.errors("orientation/final", 10.1, 21.9), atol=0.05
     )
@@ -436,6 +437,6 @@ def test_a_recorder_without_room_says_so_and_goes_on_when_there_is_room(tmp_path
     first, second = RecordingReader(tmp_path / "a.mcap"), RecordingReader(tmp_path / "a_0001.mcap")
     assert first.damage == [] and first.size >= whole and len(first.select(["sensor/attitude"])) > 500
     assert second.damage == [] and second.complete and len(second.select(["sensor/attitude"])) > 50
-    assert triline("check", tmp_path / "a_0001.mcap").returncode in (0, 1)
-    assert triline("recover", tmp_path / "a.mcap", "-o", tmp_path / "whole.mcap").returncode == 0
+    assert here("check", tmp_path / "a_0001.mcap") in (0, 1)
+    assert here("recover", tmp_path / "a.mcap", "-o", tmp_path / "whole.mcap") == 0
     assert len(RecordingReader(tmp_path / "whole.mcap").index) == len(first.index)

@@ -81,7 +81,7 @@ def test_several_may_look_on_and_one_may_count():
         wait_for(lambda: not monitor.overview.alarms(), 10, "the end of the alarm with its node")
 
 
-def test_a_source_that_nobody_heard_is_not_chosen():
+def test_a_source_that_nobody_heard_is_not_chosen(capsys):
     port, node, stop = free_port(), Listening("navigator"), threading.Event()
     with (
         Bus(port=port, source="chain") as bus,
@@ -91,11 +91,11 @@ def test_a_source_that_nobody_heard_is_not_chosen():
         wait_for(lambda: "navigator" in sender.alive(), 10, "the node")
 
         flight = attitudes(sender, "receiver", stop)
-        done = triline("confirm", "sensor/attitude", "--source", "reciever", "--port", port)
+        code = main(["confirm", "sensor/attitude", "--source", "reciever", "--port", str(port)])
         stop.set()
         flight.join()
-    assert done.returncode == 1
-    assert "--source reciever: does not speak on sensor/attitude; heard receiver" in done.stderr
+    assert code == 1
+    assert "--source reciever: does not speak on sensor/attitude; heard receiver" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -187,7 +187,7 @@ def test_a_verdict_waits_longer_for_nodes_that_live_and_are_heard_late(monkeypat
     assert (code, said.out) == (0, "GCP1 is confirmed (Ann)\n"), said.err
 
 
-def test_a_camera_in_flight_waits_for_triline_confirm_and_an_empty_one_is_malformed():
+def test_a_camera_in_flight_waits_for_triline_confirm_and_an_empty_one_is_malformed(capsys):
     camera = sample.body("configuration/camera")
     other = copy.deepcopy(camera)
     other.lenses[0].focal_length_mm *= 1.05
@@ -212,15 +212,15 @@ def test_a_camera_in_flight_waits_for_triline_confirm_and_an_empty_one_is_malfor
         done = triline("confirm", "configuration/camera", "--by", "Ann", "--port", port)
         assert done.returncode == 0, done.stderr
         assert done.stdout == "configuration/camera of 'test' is used from now on (Ann)\n"
-        again = triline("confirm", "configuration/camera", "--port", port)
-        assert again.returncode == 1
-        assert again.stderr == "triline confirm: configuration/camera: nothing waits for a decision\n"
+        again = ["confirm", "configuration/camera", "--port", str(port)]
+        assert main(again) == 1
+        told = "triline confirm: configuration/camera: nothing waits for a decision\n"
+        assert capsys.readouterr().err == told
         stop.set()
         flight.join()
-        late = triline("confirm", "configuration/camera", "--port", port)
-        assert late.returncode == 1 and "no data come; it counts when they do" in late.stderr
+        assert main(again) == 1 and "no data come; it counts when they do" in capsys.readouterr().err
     cameras = [message.body for message in node.given if message.topic == "configuration/camera"]
     assert cameras == [camera, other] and not node.alarm
-    assert triline("confirm", "sensor/nothing", "--source", "x").returncode == 1
-    refused = triline("confirm", "observation/tie")
-    assert refused.returncode == 1 and "anybody may speak on it" in refused.stderr
+    assert main(["confirm", "sensor/nothing", "--source", "x"]) == 1
+    assert main(["confirm", "observation/tie"]) == 1
+    assert "anybody may speak on it" in capsys.readouterr().err

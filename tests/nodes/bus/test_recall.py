@@ -7,7 +7,7 @@ import time
 
 import sample_messages as sample
 import zenoh
-from bus_rig import Rig, free_port, simulated_flight, triline, wait_for
+from bus_rig import Rig, free_port, here, simulated_flight, wait_for
 
 from triline.nodes import convert
 from triline.nodes.bus.recall import Recall
@@ -147,9 +147,8 @@ def test_a_flight_whose_recorder_and_adjuster_were_killed_is_whole(tmp_path):
         stopped = [rig.stop(nodes[name]) for name in ("navigator", "adjuster", "recorder")]
         assert stopped == [0, 0, 0], rig.log("adjuster")
         assert "begins with" in rig.log("adjuster") and "; 0 missing" in rig.log("recorder")
-    done = triline("process", simulated_flight(12), "-o", tmp_path / "processed.mcap")
-    assert done.returncode == 0, done.stderr
-    triline("recover", tmp_path / "live.mcap", "-o", tmp_path / "first.mcap")
+    assert here("process", simulated_flight(12), "-o", tmp_path / "processed.mcap", "--processes", 1) == 0
+    here("recover", tmp_path / "live.mcap", "-o", tmp_path / "first.mcap")
     parts = [RecordingReader(tmp_path / name) for name in ("first.mcap", "live_0001.mcap")]
     numbers = {raw.envelope.sequence for reader in parts for raw in reader.raws(reader.select([TOPIC]))}
     assert numbers == set(range(len(numbers)))  # every attitude is in one of them
