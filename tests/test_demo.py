@@ -41,7 +41,7 @@ def process(recording: Path, output: Path) -> Path:
 def demo(tmp_path_factory):
     """A flight with image lines, and a control point that a surveyor rejects on the way."""
     folder, port = tmp_path_factory.mktemp("demo"), str(free_port())
-    command = [*DEMO, "--seconds", "14", "--seed", "3", "-o", str(folder), "--port", port]
+    command = [*DEMO, "--seconds", "12", "--seed", "3", "-o", str(folder), "--port", port]
     flight = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
         wait_for_simulator(folder)
@@ -87,7 +87,7 @@ def test_tie_points_and_targets_come_from_the_image_lines(demo):
     matched = [x.body for x in messages if x.topic == "observation/tie" and len(x.body.images) > 2]
     targets = [x.body for x in messages if x.topic == "observation/target"]
     assert len(matched) > 20
-    assert sum(look.state == look.MEASURED for look in targets) > 0.9 * len(targets) > 80
+    assert sum(look.state == look.MEASURED for look in targets) > 0.9 * len(targets) > 60
     assert [(x.body.point, x.body.accepted, x.body.by) for x in messages if x.topic.endswith("verdict")] == [
         ("GCP2", False, "me")
     ]
@@ -99,7 +99,7 @@ def test_live_orientation_is_what_process_makes_of_the_recording(demo, tmp_path)
     processed = process(folder / "flight.mcap", tmp_path / "processed.mcap")
     for topic in RESULTS:
         live, again = bodies(folder / "flight.mcap", topic), bodies(processed, topic)
-        assert len(live) > 100
+        assert len(live) > (60 if topic == "observation/target" else 100)
         assert live == again, f"{topic} differs"
 
 

@@ -111,7 +111,7 @@ def judge(folder: Path, truth: users_day.Truth) -> None:
 
 
 def test_the_tutorial_on_files_of_another_program(tmp_path):
-    judge(tmp_path, fly(tmp_path, 14.0))
+    judge(tmp_path, fly(tmp_path, 11.0))
 
 
 @pytest.mark.study

@@ -68,7 +68,7 @@ def run(messages, step_s: float = 10.0, **options):
 
 
 @given(arrivals())
-@settings(max_examples=400, deadline=None, derandomize=True, database=None)
+@settings(max_examples=150, deadline=None, derandomize=True, database=None)
 def test_jitter_inside_the_allowed_lateness_does_not_change_the_order(messages):
     out, late = run(messages)
     assert not late
@@ -76,7 +76,7 @@ def test_jitter_inside_the_allowed_lateness_does_not_change_the_order(messages):
 
 
 @given(arrivals(within=20.0))
-@settings(max_examples=200, deadline=None, derandomize=True, database=None)
+@settings(max_examples=100, deadline=None, derandomize=True, database=None)
 def test_every_message_leaves_once_whatever_the_jitter(messages):
     out, late = run(messages)
     assert sorted(out) == sorted(messages)

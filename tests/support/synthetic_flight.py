@@ -17,7 +17,7 @@ from triline.solver.geometry.trajectory import Trajectory
 START_NS = 1_700_000_000 * convert.SECOND_NS
 FRAME = LocalFrame(47.0, 8.0, 0.0)
 RATE_HZ = 800.0
-POSE_HZ = 100
+POSE_HZ = 40
 GROUND_M, HEIGHT_M, SPEED = 420.0, 1920.0, 70.0
 HEADING = np.radians(65.0)  # of the strip against east, counter-clockwise
 FILTERED_SIGMA = np.array([0.9, 0.7, 1.2, 1.0e-4, 1.0e-4, 2.0e-4])
@@ -70,7 +70,7 @@ def flight_messages(seconds: float = 30.0, points: int = 120, seed: int = 5, tru
     path = Trajectory(fast, position, quaternion_from_matrix(matrix_from_angles(*angles.T)))
     wander = _wave(fast, seed + 1, FILTERED_SIGMA)
     _poses(add, "trajectory/filtered", fast, position, angles, wander, FILTERED_SIGMA)
-    slow = fast[::5]
+    slow = fast[::2]
     strip_time = slow[(slow >= 2.0) & (slow <= seconds - 2.0)]
     p, a = _truth(strip_time)
     measured = _wave(strip_time, seed + 1, FILTERED_SIGMA)
@@ -123,7 +123,7 @@ def _sensors(add, rng, t, position, angles):
         add("sensor/attitude", t[i], convert.attitude_message(START_NS + round(t[i] * 1e9), noisy, [1.5e-4] * 3))
     lever_c = np.diag([1.0, -1.0, -1.0]) @ np.array([0.4, 0.1, -1.2])
     antenna = position + R @ lever_c
-    for i in range(0, len(t), 20):
+    for i in range(0, len(t), 8):
         fix = FRAME.to_geodetic(antenna[i] + rng.normal(0, 0.5, 3))
         add("sensor/gnss", t[i], convert.gnss_message(START_NS + round(t[i] * 1e9), fix, [0.5, 0.5, 0.5]))
 

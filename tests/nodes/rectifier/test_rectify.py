@@ -156,7 +156,7 @@ def test_orientation_of_an_adjustment_goes_with_the_camera_that_it_calibrated(fl
     assert path == out / "camera.json"
     moved = [np.abs(a.xy_mm - b.xy_mm).max() for a, b in zip(found.lines, camera.lines, strict=True)]
     assert max(moved) > 1e-5
-    options = ["--gsd", 8, "--dem", folder / "dem.tif", "--dem-crs", "ellipsoid"]
+    options = ["--gsd", 8, "--height", 300]
     whole = {}
     for name in ("trajectory_refined.csv", "orientation_lines.csv"):
         told = _rectify(capsys, flown, folder / "calibrated.tif", "--trajectory", out / name, *options)
@@ -200,7 +200,7 @@ def test_a_table_of_lines_comes_back_with_the_camera_of_its_orientation(flown, f
     assert main(["export", str(flown), "--per-line", str(table), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["camera"] == str(folder / "exported" / "lines_camera.json") and told["camera_parameters"] > 0
-    options = ["--gsd", 8, "--dem", folder / "dem.tif", "--dem-crs", "ellipsoid"]
+    options = ["--gsd", 8, "--height", 300]
     images = {}
     for name, words in {"plain": [], "table": ["--trajectory", table]}.items():
         found = _rectify(capsys, flown, folder / "back.tif", *words, *options)
@@ -319,7 +319,7 @@ def test_heights_of_a_flight_folder(flown, dem, tmp_path, capsys):
     assert "wanted a table [dem] with file" in capsys.readouterr().err
 
 
-def test_sigmas_beside_the_orthoimage(flown, dem, folder, capsys):
+def test_sigmas_beside_the_orthoimage(flown, simulated, dem, folder, capsys):
     """Of the covariance of the orientation in use, the heights and matching; cells as the orthoimage."""
     sigma, values = folder / "sigma.tif", {}
     for name, options in {
@@ -336,7 +336,7 @@ def test_sigmas_beside_the_orthoimage(flown, dem, folder, capsys):
         values[name] = np.nanmedian(band, axis=(1, 2))
     # the measured orientation is known to some metres and tenths of a degree; ties and control make much more of it
     assert 5.0 < values["measured"][0] < 50.0 and values["final"][0] < 0.2 * values["measured"][0]
-    pixel = _rectify(capsys, flown, folder / "p.tif", "--dem", dem)["gsd"]
+    pixel = ground_sample(simulated.simulation.flight)
     assert values["truth"] == pytest.approx([np.hypot(np.sqrt(2) * 0.5 * pixel, 0.3), 2.0], rel=0.25)
 
 
@@ -569,7 +569,8 @@ def test_cells_in_feet_are_as_large_as_those_in_metres(flown, folder, capsys):
     # a map that is enlarged as much as Web Mercator is here: by 1 / cos 49 deg
     mercator = _rectify(capsys, flown, folder / "unit.tif", "--height", 0, "--crs", "EPSG:3857")
     assert mercator["gsd"] == pytest.approx(made["m", None]["gsd"] / np.cos(np.radians(48.9)), rel=0.05)
-    assert main(["rectify", str(flown), "-o", str(folder / "unit.tif"), "--crs", utm.format("us-ft")]) == 0
+    words = ["rectify", flown, "-o", folder / "unit.tif", "--crs", utm.format("us-ft"), "--height", 0, "--gsd", 60]
+    assert main([*map(str, words)]) == 0
     assert " ft_us in +proj=utm" in capsys.readouterr().out
 
 
@@ -637,7 +638,7 @@ def test_poses_that_are_not_valid_give_no_orientation(flown, folder, capsys):
                 writer.write(message)
     result = _rectify(capsys, folder / "aligning.mcap", folder / "aligning.tif", "--gsd", 3)
     assert result["orientation"] == "measured" and result["poses_not_valid"] == lost > 10
-    total = sum(_rectify(capsys, flown, folder / "whole.tif", "--orientation", "truth", "--gsd", 3)["strips"].values())
+    total = next(iter(Recording(flown).last_strips().values())).lines
     left, there = result["left_out"]["without orientation"], sum(result["strips"].values())
     assert left + there == total and left == pytest.approx(8.0 * total / 14.0, abs=0.02 * total)
     table = folder / "aligning.csv"

@@ -69,7 +69,7 @@ def test_orientation_errors_equal_an_independent_computation(messages, recording
         rows = np.array(rows)
         found = result["orientation"][name]
         rmse = np.sqrt((rows**2).mean(axis=0))
-        # the filtered trajectory is evaluated at 100 Hz, the independent figure at the 20 Hz of the truth
+        # the filtered trajectory is evaluated at 40 Hz, the independent figure at the 20 Hz of the truth
         tolerance = 0.01 if name == "filtered" else 1e-9
         np.testing.assert_allclose(found["rmse_m"], rmse[:3], rtol=tolerance)
         np.testing.assert_allclose(np.radians(found["rmse_deg"]), rmse[3:], rtol=tolerance)
@@ -342,7 +342,7 @@ def test_updates_without_new_rays_do_not_count_as_latency():
     assert updates_with_new_rays(reports) == [True, False, True, False, False]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, 1, pytest.param(2, marks=pytest.mark.study)])
 def test_numbers_that_are_not_finite_do_no_harm(messages, seed, tmp_path):
     rng = np.random.default_rng(seed)
     keep = () if seed else ("configuration/",)
