@@ -179,7 +179,7 @@ def _doctored(recording: Path, path: Path, change: Change) -> Run:
                 number = numbers[raw.topic]  # below 0: the message before once more
                 writer.write_raw(out._replace(envelope=out.envelope._replace(sequence=number)))
     outputs: list[RawMessage] = []
-    # when updates come is not asked for, nor all of the 200 filtered poses a second
+    # when updates come is not asked for, nor all of the 100 filtered poses a second
     nodes = [Navigator(filtered_s=0.05), Adjuster(update_s=1.0, update_rays=1000)]
     summary = process(RecordingReader(path), nodes, outputs.append)
     assert not any("failed" in counters for counters in summary.counters.values()), summary.problems
@@ -190,7 +190,7 @@ def _doctored(recording: Path, path: Path, change: Change) -> Run:
 def fly(tmp_path_factory):
     """Runs a flight of 28 s with a strip from 10 to 22 s, changed."""
     folder = tmp_path_factory.mktemp("doctored")
-    return lambda name, change: _doctored(simulated_flight(12), folder / f"{name}.mcap", change)
+    return lambda name, change: _doctored(simulated_flight(12, 100), folder / f"{name}.mcap", change)
 
 
 @pytest.fixture(scope="module")
@@ -260,8 +260,8 @@ def test_repeated_messages_change_nothing(fly, clean):
         return [raw, again] if t < 13 else [raw, raw]
 
     both = fly("twice", twice)
-    assert both.summary.dropped["duplicate"] > 200
-    assert both.summary.counters["navigator"]["attitude duplicate"] >= 199
+    assert both.summary.dropped["duplicate"] > 100
+    assert both.summary.counters["navigator"]["attitude duplicate"] >= 99
     assert both.summary.counters["navigator"]["gnss duplicate"] >= 4
     for topic in ("trajectory/filtered", "orientation/final"):
         for one, two in zip(both.poses(topic)[:2], clean.poses(topic)[:2], strict=True):

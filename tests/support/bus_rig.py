@@ -42,10 +42,10 @@ def here(*arguments: object) -> int:
 
 
 @functools.cache
-def simulated_flight(seconds: int = 8) -> Path:
+def simulated_flight(seconds: int = 8, attitude_hz: int = 200) -> Path:
     """A small flight: attitude, GNSS, tie points, control, truth."""
     path = Path(tempfile.mkdtemp(prefix="triline-tests-")) / "flight.mcap"
-    plan = ("--sensor", "ads40", "--strips", 1, "--seconds", seconds, "--seed", 3)
+    plan = ("--sensor", "ads40", "--strips", 1, "--seconds", seconds, "--seed", 3, "--attitude-rate", attitude_hz)
     assert here("simulate", "-o", path, *plan, "-q") == 0
     return path
 

@@ -103,7 +103,7 @@ def test_what_speaks_no_more_and_what_is_too_much_is_not_recalled():
 
 def test_a_flight_whose_recorder_and_adjuster_were_killed_is_whole(tmp_path):
     """The flight goes on by parts, so that it is not over before the nodes are killed on a busy machine."""
-    recorded = RecordingReader(simulated_flight(12))
+    recorded = RecordingReader(simulated_flight(12, 100))
     said = allowed = 0
 
     def hold() -> float:
@@ -147,7 +147,7 @@ def test_a_flight_whose_recorder_and_adjuster_were_killed_is_whole(tmp_path):
         stopped = [rig.stop(nodes[name]) for name in ("navigator", "adjuster", "recorder")]
         assert stopped == [0, 0, 0], rig.log("adjuster")
         assert "begins with" in rig.log("adjuster") and "; 0 missing" in rig.log("recorder")
-    assert here("process", simulated_flight(12), "-o", tmp_path / "processed.mcap", "--processes", 1) == 0
+    assert here("process", simulated_flight(12, 100), "-o", tmp_path / "processed.mcap", "--processes", 1) == 0
     here("recover", tmp_path / "live.mcap", "-o", tmp_path / "first.mcap")
     parts = [RecordingReader(tmp_path / name) for name in ("first.mcap", "live_0001.mcap")]
     numbers = {raw.envelope.sequence for reader in parts for raw in reader.raws(reader.select([TOPIC]))}
