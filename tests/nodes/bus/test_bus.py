@@ -330,7 +330,8 @@ def test_queries_are_answered(tmp_path):
         thread.join()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+# nodes that are stopped by SIGINT end well in the tests of what is recalled and of nodes that are killed
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.study), signal.SIGTERM])
 def test_a_stop_under_load_is_clean(rig, number, tmp_path):
     recorder = rig.start("node", "recorder", "-o", tmp_path / "a.mcap")
     navigator = rig.start("node", "navigator")

@@ -81,7 +81,7 @@ def test_two_processes_give_the_bytes_of_one(flights):
 
 
 @pytest.mark.skipif(not Ahead.possible(), reason="one processor only, or no fork")
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [pytest.param("attitude", marks=pytest.mark.study), "inertial"])
 def test_what_only_the_last_node_needs_is_checked_by_the_process_ahead(flights, tmp_path, kind):
     path, reader = tmp_path / "spoilt.mcap", RecordingReader(flights[kind][1])
     spoilt = 0
