@@ -72,12 +72,8 @@ class Overview:
 
     def losses(self) -> dict[str, int]:
         """Sums over all nodes of what should be zero on a good day."""
-        sums: dict[str, int] = dict.fromkeys(LOSSES, 0)
-        for status in self.nodes.values():
-            for topic in status.topics:
-                for kind in sums:
-                    sums[kind] += getattr(topic, kind)
-        return sums
+        each = [losses_of(status) for status in self.nodes.values()]
+        return {kind: sum(of[kind] for of in each) for kind in LOSSES}
 
     def take_status(self, name: str, status: Any) -> None:
         """The newest status of a node."""
@@ -119,7 +115,7 @@ class Overview:
             name: {
                 "state": self.state_of(name), "lag_s": s.lag_s, "queued": s.queued, **self._light(name),
                 "alarm": s.alarm, "last_problem": s.last_problem, "counters": {c.name: c.value for c in s.counters},
-                **{kind: sum(getattr(t, kind) for t in s.topics) for kind in LOSSES},
+                **losses_of(s),
             }
             for name, s in sorted(self.nodes.items())
         }  # fmt: skip
@@ -211,8 +207,7 @@ def screen(overview: Overview, title: str, watch: SensorWatch | None = None) -> 
         nodes.add_column(name, justify=justify, no_wrap=True, ratio=room)
     for name in sorted(overview.nodes):
         s = overview.nodes[name]
-        bad = {k: sum(getattr(t, k) for t in s.topics) for k in LOSSES}
-        text = ", ".join(_counted(n, kind) for kind, n in bad.items() if n)
+        text = ", ".join(_counted(n, kind) for kind, n in losses_of(s).items() if n)
         nodes.add_row(
             Text(plain(name, LONGEST_NAME)), Text(plain(overview.state_of(name), LONGEST_TEXT)), f"{s.lag_s:.2f} s",
             str(s.queued), Text(text or "-", style="yellow" if text else "dim"),
@@ -337,6 +332,14 @@ def watch_platform(options: ProgramOptions, quiet: bool = False) -> Overview:
         sys.stdout.write(f"{monitor.overview.line()}\n")
         sys.stdout.flush()
     return monitor.overview
+
+
+def losses_of(status: Any) -> dict[str, int]:
+    """What a node lost, by kind; not a status that was dropped on the way, since a newer one followed."""
+    return {
+        kind: sum(getattr(t, kind) for t in status.topics if kind != "gaps" or not t.topic.startswith("status/"))
+        for kind in LOSSES
+    }
 
 
 def _counted(n: int, kind: str) -> str:

@@ -39,6 +39,16 @@ def test_a_dumb_terminal_gets_lines(monkeypatch, term, over):
         assert "processing: 50 %" in err.getvalue() and "\x1b" not in out.getvalue() + err.getvalue()
 
 
+def test_a_status_that_was_dropped_is_nothing_lost():
+    """It may be, so that it slows nobody down; on a busy machine the line of a flight said "1 gap" to its end."""
+    overview, status = Overview(), m.NodeStatus(node="recorder")
+    status.topics.add(topic="status/simulator", gaps=2)
+    overview.take_status("recorder", status)
+    assert "gap" not in overview.line() and overview.losses()["gaps"] == 0
+    status.topics.add(topic="sensor/gnss", gaps=1)
+    assert overview.line().endswith("1 gap") and overview.as_json()["nodes"]["recorder"]["gaps"] == 1
+
+
 def test_lag_and_queue_are_whole_on_a_narrow_terminal():
     overview = Overview()
     state = "running, GNSS clock not seen: no turns were flown so far"

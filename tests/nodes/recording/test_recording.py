@@ -256,6 +256,17 @@ def test_missing_and_repeated_numbers_are_counted(tmp_path):
     assert findings(reader)[0] == "sensor/gnss: 2 messages missing by their numbers"
 
 
+def test_a_status_that_was_dropped_is_no_damage(tmp_path):
+    """It may be, so that it slows nobody down, and a newer one follows: recordings of a busy flight were `damaged`."""
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        for i, number in enumerate((0, 1, 3)):
+            message = sample.message("status/navigator", i)
+            writer.write(Message(message.topic, message.stamp_ns, message.body, "test", number))
+    reader = RecordingReader(tmp_path / "a.mcap")
+    assert [row.gaps for row in topic_summaries(reader)] == [1]
+    assert not any("missing" in text for text in findings(reader))
+
+
 # ---- envelopes and image lines
 
 
