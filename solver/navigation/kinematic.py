@@ -96,13 +96,12 @@ class KinematicFilter:
         return kf
 
     @cached_property
-    def _ahead(self) -> list[tuple[Array, Array, Array, Array]]:
-        """What takes the covariance of an epoch to the times after it: of the position, and without the slow errors."""
-        found: list[tuple[Array, Array, Array, Array]] = []
-        for dt in _AHEAD_S:
-            F, Q = self._transition(float(dt))
-            found.append((F[P], Q[P, P], self._H @ F, self._H @ Q @ self._H.T))
-        return found
+    def _ahead(self) -> tuple[Array, Array, Array, Array]:
+        """What takes the covariance of an epoch to the times after it: of the position (n, 3, 15) and the noise that
+        comes to it (n, 3, 3), and both without the slow errors."""
+        steps = [self._transition(float(dt)) for dt in _AHEAD_S]
+        F, Q = np.stack([F for F, _ in steps]), np.stack([Q for _, Q in steps])
+        return F[:, P], Q[:, P, P], self._H @ F, self._H @ Q @ self._H.T
 
     # -- input ---------------------------------------------------------------------------------------------------------
 
@@ -304,10 +303,9 @@ class KinematicFilter:
     def _look_ahead(self) -> None:
         """Covariance of the position at a few times after the newest epoch, and the frame at the platform."""
         last = self._epochs[-1]
-        for i, (F_P, Q_P, HF, HQH) in enumerate(self._ahead):
-            self._ahead_cov[i] = F_P @ last.P @ F_P.T + Q_P
-            self._ahead_white_m[i] = np.sqrt((HF @ last.P @ HF.T + HQH).trace())
-        self._ahead_cov += self._offset_cov
+        F_P, Q_P, HF, HQH = self._ahead
+        self._ahead_cov = F_P @ last.P @ F_P.transpose(0, 2, 1) + Q_P + self._offset_cov
+        self._ahead_white_m = np.sqrt((HF @ last.P @ HF.transpose(0, 2, 1) + HQH).trace(axis1=1, axis2=2))
         self._maker.move(last.time_s, last.x[P], last.x[V])
         self._state_scalars = last.x[:9].tolist()
 
