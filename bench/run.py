@@ -139,7 +139,7 @@ BENCHMARKS = (
         "hours",
         "Do sigmas stay right over two hours?",
         ("python bench/drift.py --minutes 120",),
-        8,
+        18,
     ),
     Benchmark(
         "inertial",
