@@ -147,6 +147,11 @@ def begins_flight(topic: str) -> bool:
     return row.family in (Family.SENSOR, Family.OBSERVATION, Family.RESULT) and not row.latched
 
 
+def may_be_dropped(topic: str) -> bool:
+    """Whether a message may be lost on the way, so that it slows nobody down: a newer one follows."""
+    return topic.startswith("status/")
+
+
 @lru_cache(maxsize=1024)
 def rank(topic: str) -> int:
     """Place in the table: decides between messages with equal stamps."""

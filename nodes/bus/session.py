@@ -259,8 +259,7 @@ class Bus:
 
     def _declare_publisher(self, topic: str, session: Any) -> Any:
         row = topics.find(topic)
-        # Status is the one thing that must never slow anybody down.
-        dropped = row.family is topics.Family.STATUS
+        dropped = topics.may_be_dropped(topic)
         options: dict[str, Any] = {
             "encoding": zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(row.type_name),
             "congestion_control": zenoh.CongestionControl.DROP if dropped else zenoh.CongestionControl.BLOCK,

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ...schemas.topics import may_be_dropped
 from ..bus.bundle import ExpiryWatch, load_bundle
 from ..bus.folder_lock import locked
 from ..bus.processes import NodeGroup, NodeProcess
@@ -321,7 +322,7 @@ class LiveFlight:
         for name, status in self._overview.nodes.items():
             for topic in status.topics if name != "viewer" else ():
                 for kind in kinds:
-                    if getattr(topic, kind) and not topic.topic.startswith("status/"):
+                    if getattr(topic, kind) and not may_be_dropped(topic.topic):
                         sums[f"{name}: {topic.topic} {kind}"] = getattr(topic, kind)
             refused = sum(c.value for c in status.counters if c.name == "malformed" and name in self.estimators)
             if "malformed" in kinds and refused:  # what it could read, and could not use, among them

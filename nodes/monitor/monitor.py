@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from ...schemas import messages as m
+from ...schemas.topics import may_be_dropped
 from ...solver.window.quality.determinability import ESTIMATED
 from .. import convert
 from ..config import build
@@ -337,7 +338,7 @@ def watch_platform(options: ProgramOptions, quiet: bool = False) -> Overview:
 def losses_of(status: Any) -> dict[str, int]:
     """What a node lost, by kind; not a status that was dropped on the way, since a newer one followed."""
     return {
-        kind: sum(getattr(t, kind) for t in status.topics if kind != "gaps" or not t.topic.startswith("status/"))
+        kind: sum(getattr(t, kind) for t in status.topics if kind != "gaps" or not may_be_dropped(t.topic))
         for kind in LOSSES
     }
 

@@ -165,7 +165,7 @@ class Recorder(Node):
     @property
     def missing(self) -> int:
         """How many messages never came, by their numbers; what nodes say of their health does not count."""
-        return sum(c.gaps for topic, c in self._check.counts.items() if not topic.startswith("status/"))
+        return sum(c.gaps for topic, c in self._check.counts.items() if not topics.may_be_dropped(topic))
 
     def recall(self, bus: Bus) -> Recall:
         """Asks for what this recorder has missed."""

@@ -200,7 +200,7 @@ def findings(reader: RecordingReader, *, decode: bool = True, outside: bool = Tr
     if reader.problems["without a channel"]:
         found.append(f"{reader.problems['without a channel']} messages without a channel")
     for row in topic_summaries(reader):
-        if row.gaps and not row.topic.startswith("status/"):  # that may be dropped, and a newer one follows
+        if row.gaps and not topics.may_be_dropped(row.topic):
             found.append(f"{row.topic}: {row.gaps} messages missing by their numbers")
         if row.duplicates:
             found.append(f"{row.topic}: {row.duplicates} messages twice")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from ...schemas.topics import may_be_dropped
 from ...solver.window.output import BETTER
 from ...solver.window.quality.determinability import LEFT_OF_PRIOR, NOT_YET
 from . import figures
@@ -92,7 +93,7 @@ def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
     if "latency_s" in result:
         text = "from the newest ray to the result that contains it, median"
         tiles.append((f"{1000 * result['latency_s']['median']:.0f} ms", text, ""))
-    lost = sum(topic["gaps"] for name, topic in result["topics"].items() if not name.startswith("status/"))
+    lost = sum(topic["gaps"] for name, topic in result["topics"].items() if not may_be_dropped(name))
     return [*tiles, (str(lost), "messages missing by their numbers", "bad" if lost else "good")]
 
 
