@@ -11,6 +11,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from .last_problems import shortened
+
 
 @dataclass(slots=True)  # frozen ones take four times as long to make, and there are hundreds a second
 class Message:
@@ -56,7 +58,8 @@ class Node:
 
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
-        self.last_problem = ""
+        self.last_problem = ""  # the newest
+        self.last_problems: dict[str, str] = {}  # the newest of each kind
         self.alarms: dict[str, str] = {}  # what an operator has to look at now, by kind; runners set some of them
 
     def step(self, message: Message) -> Iterable[Message]:
@@ -96,6 +99,9 @@ class Node:
         return "; ".join(dict.fromkeys(filter(None, self.alarms.values())))
 
     def problem(self, kind: str, text: str) -> None:
-        """Count bad data of a kind (a short counter name) and keep one line about the newest case."""
+        """Count bad data of a kind and keep one line about its newest case.
+
+        A kind is a short counter name, one of few that the program knows and never made of the data.
+        """
         self.counters[kind] += 1
-        self.last_problem = text
+        self.last_problem = self.last_problems[kind] = shortened(text)

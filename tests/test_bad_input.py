@@ -298,7 +298,7 @@ def test_positions_two_seconds_out_of_order(fly, clean):
 
     back = fly("backwards", backwards)
     assert back.summary.dropped == {"malformed": 1}
-    assert "time goes back by 1.8 s" in back.summary.last_problem
+    assert "time goes back by 1.8 s" in back.summary.last_problems["malformed"]
     np.testing.assert_allclose(
         back.errors("orientation/final", 10.1, 21.9), clean.errors("orientation/final", 10.1, 21.9), atol=0.02
     )

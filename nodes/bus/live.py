@@ -289,8 +289,11 @@ class BusRunner:
         begun = time.monotonic()
         with self._lock:  # queries are answered between steps
             outputs = self._driver.step(message)
-        if self.node.counters["failed"] > failed or self.node.counters["malformed"] > refused == 0:
-            self._report(f"{self.node.name}: {self.node.last_problem}")
+        last = self.node.last_problems
+        if self.node.counters["failed"] > failed:
+            self._report(f"{self.node.name}: {last['failed']}")
+        if self.node.counters["malformed"] > refused == 0:
+            self._report(f"{self.node.name}: {last['malformed']}")
         for output in outputs:
             self._publish(output)
         self._worked_ns = max(self._worked_ns, message.stamp_ns)

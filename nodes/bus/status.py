@@ -14,6 +14,8 @@ from .session import Bus
 STATUS_PERIOD_S = 0.5
 #: What an alarm says without which nothing can be right.
 NO_TRAJECTORY = "no trajectory for"
+#: Counts how often the session of a node was opened anew.
+ANEW = "session opened anew"
 #: Another node of the same name that was heard twice within this time is there, s.
 ANOTHER_S = 3.0
 
@@ -64,7 +66,8 @@ class StatusPublisher:
         """Publish what the arguments say; ``stamp_ns`` is the newest platform time known (0: none yet)."""
         now = time.monotonic()
         if self._bus.opened_anew:
-            node.counters["session opened anew"] = len(self._bus.opened_anew)
+            node.counters[ANEW] = len(self._bus.opened_anew)
+            node.last_problems[ANEW] = f"the session was opened anew: {self._bus.opened_anew[-1]}"
         node.alarms["another"] = "" if node.onlooker else self._another()
         light, reason = node.light()
         if node.alarm and light:  # not all is well, whatever the figures say
@@ -86,5 +89,5 @@ class StatusPublisher:
                 malformed=c.malformed + extra.get(topic, 0), dropped=c.dropped, rate_hz=rate,
             )  # fmt: skip
         for name, value in sorted(node.counters.items()):
-            status.counters.add(name=name, value=int(value))
+            status.counters.add(name=name, value=int(value), last_problem=node.last_problems.get(name, ""))
         self._bus.publish(Message(f"status/{self._name}", stamp_ns, status, self._name))

@@ -18,6 +18,7 @@ from ..bus.processes import NodeGroup
 from ..convert import check_place
 from ..errors import UserError
 from ..formats.json_text import json_text
+from ..last_problems import last_of
 from ..monitor.sensor_watch import SensorWatch
 from ..ordering import MAX_JUMP_NS
 from .live_flight import DRAIN_S, ESTIMATORS, LiveFlight, add_view_arguments, seconds_between
@@ -280,7 +281,7 @@ class Fly(LiveFlight):
             for counter in status.counters:
                 if (id in self.programs or counter.name == "malformed") and (id, counter.name) not in self._told:
                     self._told.add((id, counter.name))
-                    self.watch.tell(f"{id}: {counter.name}: {status.last_problem}")
+                    self.watch.tell(f"{id}: {counter.name}: {last_of(status, counter)}")
 
     def _tell_phase(self) -> None:
         assert self.watch is not None

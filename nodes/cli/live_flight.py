@@ -24,6 +24,7 @@ from ..bus.processes import NodeGroup, NodeProcess
 from ..bus.program import end_by_signal
 from ..errors import UserError
 from ..formats.new_file import refuse_unless_folder
+from ..last_problems import last_of
 from ..monitor.monitor import ENDING, display
 from ..step_driver import failure_words
 
@@ -378,9 +379,9 @@ def failed_nodes(statuses: Mapping[str, Any]) -> dict[str, str]:
     """By node, how often its work failed, by the newest status of each: what it would have given is missing."""
     failed = {}
     for name, status in statuses.items():
-        times = sum(counter.value for counter in status.counters if counter.name == "failed")
-        if times:
-            failed[name] = failure_words(times, f"its last problem: {status.last_problem}")
+        for counter in status.counters:
+            if counter.name == "failed" and counter.value:
+                failed[name] = failure_words(counter.value, f"its last problem: {last_of(status, counter)}")
     return failed
 
 

@@ -14,6 +14,7 @@ from ..config import Tables, build, load
 from ..errors import UserError
 from ..formats.json_text import json_text
 from ..garbage_collection import RareCollections
+from ..last_problems import in_words
 from ..node import Node
 from ..terminal import plain
 from .bus_options import add_bus_arguments, bus_of, reporter
@@ -64,7 +65,8 @@ def run_on_bus(node: Node, options: ProgramOptions) -> int:
             options.report(f"{node.name} at {url}")
         runner.run()
     counted = ", ".join(f"{n} {kind}" for kind, n in sorted(node.counters.items()))
-    options.report("; ".join(filter(None, (f"{node.name} stopped", counted, counted and node.last_problem))))
+    last = in_words(node.counters, node.last_problems)
+    options.report("; ".join(filter(None, (f"{node.name} stopped", counted, last))))
     return 0
 
 

@@ -20,6 +20,7 @@ from ..formats.importable import refuse_importable
 from ..formats.json_text import json_text
 from ..formats.new_file import refuse_unless_file
 from ..garbage_collection import RareCollections
+from ..last_problems import in_words
 from ..node import Node
 from ..recording.reader import RecordingReader
 from ..recording.remote import path_of
@@ -210,6 +211,7 @@ def result(summary: ProcessSummary, reader: RecordingReader, output: Path, secon
         "lost_bytes": sum(damage.length for damage in reader.damage),
         "counters": summary.counters,
         "problems": summary.problems,
+        "problems_by_kind": summary.problems_by_kind,
         "failed": summary.failed,
         "flight_s": (summary.last_ns - summary.first_ns) / 1e9,
         "seconds": round(seconds, 3),
@@ -227,7 +229,7 @@ def _lines(summary: ProcessSummary, output: Path, seconds: float) -> list[str]:
     lines += [f"  {topic:<24} {n:>9} out" for topic, n in sorted(summary.outputs.items())]
     if summary.dropped:
         counted = ", ".join(f"{n} {kind}" for kind, n in sorted(summary.dropped.items()))
-        lines.append(f"  left out: {counted}" + (f"; the last: {summary.last_problem}" if summary.last_problem else ""))
+        lines += _wrapped(f"left out: {counted}", in_words(summary.dropped, summary.last_problems))
     if summary.notes:
         more = len(summary.notes) - 1
         lines.append(f"  used all the same: {summary.notes[-1]}" + (f" (and {more} more)" if more else ""))
@@ -235,7 +237,11 @@ def _lines(summary: ProcessSummary, output: Path, seconds: float) -> list[str]:
         if any(counters.values()):
             by_number = sorted(((n, kind) for kind, n in counters.items() if n), key=lambda c: (-c[0], c[1]))
             counted = ", ".join(f"{n} {kind}" for n, kind in by_number)
-            last = summary.problems.get(name)
-            text = f"{name}: {counted}" + (f"; the last: {last}" if last else "")
-            lines += textwrap.wrap(text, 116, initial_indent="  ", subsequent_indent="    ", break_long_words=False)
+            lines += _wrapped(f"{name}: {counted}", in_words(counters, summary.problems_by_kind.get(name, {})))
     return lines
+
+
+def _wrapped(counted: str, last: str) -> list[str]:
+    """What was counted, and the last problems, as indented lines."""
+    text = f"{counted}; {last}" if last else counted
+    return textwrap.wrap(text, 116, initial_indent="  ", subsequent_indent="    ", break_long_words=False)

@@ -116,6 +116,7 @@ class Overview:
             name: {
                 "state": self.state_of(name), "lag_s": s.lag_s, "queued": s.queued, **self._light(name),
                 "alarm": s.alarm, "last_problem": s.last_problem, "counters": {c.name: c.value for c in s.counters},
+                "last_problems": {c.name: c.last_problem for c in s.counters if c.last_problem},
                 **losses_of(s),
             }
             for name, s in sorted(self.nodes.items())

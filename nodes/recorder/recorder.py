@@ -176,7 +176,7 @@ class Recorder(Node):
         return 1
 
     def state(self) -> str:
-        return "recording" if self._writer is not None else f"not recording: {self.last_problem}"
+        return "recording" if self._writer is not None else f"not recording: {self.last_problems.get('disk', '')}"
 
     def start(self) -> None:
         """Open the first file.
@@ -360,7 +360,7 @@ class Recorder(Node):
     def _tell_disk(self) -> None:
         """An alarm for who looks at the monitor: nothing is recorded, or not for long any more."""
         if self._writer is None:
-            self.alarms["disk"] = f"NOT RECORDING: {self.last_problem}; {self._lost} messages lost so far"
+            self.alarms["disk"] = f"NOT RECORDING: {self.last_problems['disk']}; {self._lost} messages lost so far"
             return
         if self.alarms.get("disk", "").startswith("NOT"):
             self.alarms["disk"] = ""
@@ -396,7 +396,8 @@ class Recorder(Node):
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._open()
         except OSError as error:
-            self.last_problem = f"{why}{self._path}: {(error.strerror or str(error)).lower()}"
+            text = f"{why}{self._path}: {(error.strerror or str(error)).lower()}"
+            self.last_problem = self.last_problems["disk"] = text
         else:
             self.problem("resumed", f"{why}recording again, into {self.files[-1]}; {self._lost} messages lost")
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ...schemas import codec, topics
 from ...schemas.envelope import Envelope, RawMessage
 from ...schemas.topics import Family
+from ..last_problems import shortened
 from ..node import Message, Node
 from ..ordering import Key, order_key
 from ..step_driver import StepDriver, failure_words
@@ -36,10 +37,10 @@ class ProcessSummary:
     nodes : names of the nodes that ran
     inputs, outputs : messages by topic
     replaced : recorded messages by topic that the nodes made anew
-    dropped : messages that were not usable, by kind
+    dropped : messages that were not usable, by kind; ``last_problems`` says what was wrong with the last of each
     notes : what of the recording was used and should be known
     counters : per node, what it counted
-    problems : per node, its last problem
+    problems, problems_by_kind : per node, its last problem, and the last of each kind that it counts
     failed : per node whose work failed, how often, and at what first
     states : per node, what it said of itself at the end
     first_ns, last_ns : platform time of what was measured and computed, 0 without any
@@ -51,9 +52,10 @@ class ProcessSummary:
     replaced: Counter[str] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
-    last_problem: str = ""
+    last_problems: dict[str, str] = field(default_factory=dict)
     counters: dict[str, dict[str, int]] = field(default_factory=dict)
     problems: dict[str, str] = field(default_factory=dict)
+    problems_by_kind: dict[str, dict[str, str]] = field(default_factory=dict)
     failed: dict[str, str] = field(default_factory=dict)
     states: dict[str, str] = field(default_factory=dict)
     first_ns: int = 0
@@ -62,15 +64,16 @@ class ProcessSummary:
     def drop(self, kind: str, text: str, n: int = 1) -> None:
         """Count messages that are not usable."""
         self.dropped[kind] += n
-        self.last_problem = text
+        self.last_problems[kind] = shortened(text)
 
     def add(self, other: ProcessSummary) -> None:
         """What other nodes of the same run did; inputs are counted once."""
         self.outputs += other.outputs
         self.dropped += other.dropped
-        self.last_problem = other.last_problem or self.last_problem
+        self.last_problems |= other.last_problems
         self.counters |= other.counters
         self.problems |= other.problems
+        self.problems_by_kind |= other.problems_by_kind
         self.failed |= other.failed
         self.states |= other.states
 
@@ -161,7 +164,7 @@ def process(
     )  # fmt: skip
     numbers = found.numbers
     summary.replaced, summary.dropped, summary.notes = found.replaced, found.left_out, found.notes
-    summary.last_problem = found.last_problem
+    summary.last_problems = found.last_problems
     summary.first_ns, summary.last_ns = time_span_ns(reader, numbers) or (0, 0)
     last = _begin_of_end(reader, numbers, drivers)
     told = _Progress(progress, len(numbers))
@@ -470,6 +473,7 @@ class _Line:
             self._summary.states[node.name] = node.state()
             if node.last_problem:
                 self._summary.problems[node.name] = node.last_problem
+                self._summary.problems_by_kind[node.name] = dict(node.last_problems)
             if inbox.driver.first_failure:
                 why = f"the first time at {inbox.driver.first_failure}"
                 self._summary.failed[node.name] = failure_words(node.counters["failed"], why)

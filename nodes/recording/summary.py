@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ...schemas import topics
 from ...schemas.topics import Family
 from ..errors import UserError
+from ..last_problems import in_words
 from .reader import RecordingReader
 from .usable import usable
 
@@ -210,11 +211,10 @@ def findings(reader: RecordingReader, *, decode: bool = True, outside: bool = Tr
         for _ in reader.messages():
             pass
         used = usable(reader, lambda channel: False, lambda topic: True)
-        number = used.left_out["malformed"] + used.left_out["late"] + used.left_out["clock"]
-        if number:
-            found.append(
-                f"{number} messages that nodes leave out for their stamps or numbers; the last: {used.last_problem}"
-            )
+        left_out = {kind: used.left_out[kind] for kind in ("malformed", "late", "clock")}
+        if any(left_out.values()):
+            last = in_words(left_out, used.last_problems)
+            found.append(f"{sum(left_out.values())} messages that nodes leave out for their stamps or numbers; {last}")
         found += used.notes
         if reader.problems["malformed"]:
             number = reader.problems["malformed"]

@@ -13,6 +13,7 @@ from ...schemas import topics
 from ...schemas.envelope import Envelope
 from ...schemas.topics import Family
 from ...solver.navigation.clock_check import LARGEST_DELAY_S, offset_in_words
+from ..last_problems import shortened
 from ..ordering import MAX_JUMP_NS, MILLISECOND_NS, REBASE_AFTER, PlatformTime, StreamCheck, is_orderly
 from .index import Channel
 from .reader import RecordingReader
@@ -32,20 +33,20 @@ class Usable:
     ----------
     numbers : of the messages, in order
     replaced : by topic, recorded messages that are made anew
-    left_out : messages that are not used, by kind; ``last_problem`` says what was wrong with the last of them
+    left_out : messages that are not used, by kind; ``last_problems`` says what was wrong with the last of each
     notes : what was used all the same, and should be known
     """
 
     numbers: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     replaced: Counter[str] = field(default_factory=Counter)
     left_out: Counter[str] = field(default_factory=Counter)
-    last_problem: str = ""
+    last_problems: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     def drop(self, kind: str, text: str, n: int = 1) -> None:
         """Count messages that are not used."""
         self.left_out[kind] += n
-        self.last_problem = text
+        self.last_problems[kind] = shortened(text)
 
     def told(self, kind: str, text: str) -> None:
         """What a `StreamCheck` tells: of a clock that was set back it believes the messages."""

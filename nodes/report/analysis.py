@@ -105,7 +105,11 @@ def _node(status: Any) -> dict[str, Any]:
         if getattr(topic, kind)
     }
     counters = {counter.name: int(counter.value) for counter in status.counters}
-    return {"state": status.state, "counters": counters | losses, "last_problem": status.last_problem}
+    last = {counter.name: counter.last_problem for counter in status.counters if counter.last_problem}
+    return {
+        "state": status.state, "counters": counters | losses,
+        "last_problem": status.last_problem, "last_problems": last,
+    }  # fmt: skip
 
 
 def _parameter(p: Any, since_s: float | None) -> dict[str, Any]:

@@ -128,10 +128,8 @@ def publish(options: ProgramOptions, sensor: Sensor) -> int:
         said_ns = _said_ns(bus, options.stop, sensor.name) if sensor.from_begin else 0
         for message in sensor.messages(options.stop):
             if message is not None and message.stamp_ns <= said_ns:
-                if not sensor.counters["said before"]:
-                    until = datetime.fromtimestamp(said_ns // SECOND_NS, UTC)
-                    sensor.last_problem = f"what was published up to {until:%H:%M:%S} UTC is not said again"
-                sensor.counters["said before"] += 1
+                until = datetime.fromtimestamp(said_ns // SECOND_NS, UTC)
+                sensor.problem("said before", f"what was published up to {until:%H:%M:%S} UTC is not said again")
             elif message is not None:
                 if message.topic == "sensor/imu":
                     state_noise(message.body, sensor.noise)
@@ -140,7 +138,7 @@ def publish(options: ProgramOptions, sensor: Sensor) -> int:
                 stamp_ns = message.stamp_ns
             for kind in sensor.counters.keys() - told:
                 told.add(kind)
-                options.report(f"{sensor.name}: {kind}: {sensor.last_problem}")
+                options.report(": ".join(filter(None, (sensor.name, kind, sensor.last_problems.get(kind)))))
             if status.due():
                 status.publish(sensor.state(), {}, sensor, 0.0, 0, stamp_ns)
         status.publish(sensor.state(), {}, sensor, 0.0, 0, stamp_ns)

@@ -187,7 +187,8 @@ def test_a_full_disk_is_reported_the_recorder_lives_and_resumes(disk, tmp_path):
     recorder.tend()
     assert recorder.alarm.startswith(f"NOT RECORDING: {tmp_path / 'a.mcap'}: no space left on device; ")
     recorder.tend()  # still full
-    assert recorder.state().startswith("not recording: ")
+    recorder.problem("malformed", "sensor/imu 4: empty")  # does not take the place of the reason
+    assert recorder.state() == f"not recording: {tmp_path / 'a.mcap'}: no space left on device"
     disk.room = 10**9
     recorder.tend()
     assert recorder.state() == "recording"

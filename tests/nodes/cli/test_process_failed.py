@@ -34,8 +34,9 @@ def test_it_is_told_at_what_and_how_often(failing, options, tmp_path, capsys):
     line = (
         "navigator failed twice, its results are not complete; the first time at sensor/gnss 19: IndexError: by design"
     )
-    assert told.err.startswith(f"triline process: {strip}: {line} (test_process_failed.py:")
-    assert told.err.count("\n") == 1 and out.is_file()
+    (said,) = (text for text in told.err.splitlines() if not text.startswith("processing: "))  # on a busy machine
+    assert said.startswith(f"triline process: {strip}: {line} (test_process_failed.py:")
+    assert out.is_file()
     if "--json" in options:
         result = json.loads(told.out)
         assert list(result["failed"]) == ["navigator"] and result["counters"]["navigator"]["failed"] == 2

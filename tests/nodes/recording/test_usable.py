@@ -49,7 +49,7 @@ def test_what_jumps_ahead_at_the_very_end_is_counted(tmp_path, last):
     gnss[-1] = (gnss[-1][0], GNSS, *last)
     reader = recording(tmp_path / "flight.mcap", stream(ATTITUDE, 100.0, 5.0), gnss)
     found, stamps = used(reader)
-    assert found.left_out == {"malformed": 1} and "jump" in found.last_problem
+    assert found.left_out == {"malformed": 1} and "jump" in found.last_problems["malformed"]
     assert time_span_ns(reader, found.numbers) == (BEGIN_NS, BEGIN_NS + 4_990_000_000)
     assert len(stamps[GNSS]) == 24 and len(stamps[ATTITUDE]) == 500
 
@@ -60,7 +60,7 @@ def test_a_stream_that_is_an_hour_ahead_of_all_others_is_left_out(tmp_path, sinc
     reader = recording(tmp_path / "flight.mcap", stream(ATTITUDE, 100.0, 5.0), [(t + 0.1, *row) for t, *row in gnss])
     found, stamps = used(reader)
     assert found.left_out == {"clock": sum(stamp > 60 for _, _, stamp, _ in gnss)}
-    assert "sensor/gnss of 'gnss' is stamped 3599.9 s ahead of everything else" in found.last_problem
+    assert "sensor/gnss of 'gnss' is stamped 3599.9 s ahead of everything else" in found.last_problems["clock"]
     assert max(stamps[GNSS], default=0.0) < 5 and len(stamps[ATTITUDE]) == 500
     assert np.subtract(*time_span_ns(reader, found.numbers)[::-1]) < 5e9
     assert np.subtract(*time_span_ns(reader)[::-1]) > 3600e9

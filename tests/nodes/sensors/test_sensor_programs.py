@@ -219,9 +219,10 @@ def flown(folder, nodes=(), place=None):
 def test_image_lines_that_no_node_can_use_are_told_in_flight_and_at_its_end(folder):
     """A camera.json of 200 px for lines of 180: all of them were refused, and a flight ended without a word of it."""
     why = "sensor/lines/N: lines of N of 180 samples, wanted 200"
-    status = m.NodeStatus(node="matcher", last_problem=why)
+    status = m.NodeStatus(node="matcher", last_problem="lines of N came 0.9 s behind")
     status.counters.add(name="cells without texture", value=3)
-    status.counters.add(name="malformed", value=130)
+    status.counters.add(name="late", value=2, last_problem="lines of N came 0.9 s behind")
+    status.counters.add(name="malformed", value=130, last_problem=why)
     flight = flown(folder, [status])
     assert flight.watch.lines == [f"matcher: malformed: {why}"]
     lost = flight._lost_so_far(("gaps", "malformed", "dropped"))
