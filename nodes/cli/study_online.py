@@ -61,7 +61,7 @@ def fly(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     flight = collect(messages_of(processed))
     evaluated = evaluate_flight(flight)
     middle = {}
-    for kind, (_, error, covariance) in orientation_errors(flight).items():
+    for kind, (_, error, covariance, _) in orientation_errors(flight).items():
         half = len(error) // 2
         middle[kind] = float(normalised_error_squared(error[half : half + 1], covariance[half : half + 1])[0]) / 6.0
     return {**evaluated, "middle_nees": middle}

@@ -95,7 +95,7 @@ def fly(case: tuple[str, bool, dict[str, Any]]) -> dict[str, Any]:
         lengths = [m.body.window_end_ns - m.body.window_start_ns for m in reader.messages(["adjustment/report"])]
         window_ns = min(stamps, default=0) + max(lengths, default=0)
         found = collect(messages_of(out))
-    time_ns, error, _ = orientation_errors(found)["live"]
+    time_ns, error, *_ = orientation_errors(found)["live"]
     absolute = displacement_px(simulation.flight, (time_ns - EPOCH_NS) * 1e-9, error)
     stamp_ns, between = np.array(matcher.noted, dtype=float).reshape(-1, 2).T
     return {

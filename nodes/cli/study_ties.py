@@ -121,7 +121,7 @@ def processed(
     with RecordingWriter(out) as writer:
         process(RecordingReader(recording), nodes, writer.write_raw)
     flight = collect(messages_of(out))
-    time_ns, error, _ = orientation_errors(flight)["final"]
+    time_ns, error, *_ = orientation_errors(flight)["final"]
     ground = checks.errors((time_ns - EPOCH_NS) * 1e-9, error)
     squares = np.concatenate([(error**2).mean(axis=0), (ground**2).mean(axis=0)])
     ties = list(RecordingReader(out).messages(["observation/tie"]))

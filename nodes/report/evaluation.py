@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,8 +74,8 @@ def evaluate_flight(flight: Flight) -> dict[str, Any]:
     """
     result: dict[str, Any] = {"orientation": {}, "points": {}, "check": {}, "control": {}, "missing": missing(flight)}
     errors = orientation_errors(flight)
-    for name, (_, error, covariance) in errors.items():
-        result["orientation"][name] = _orientation_row(error, covariance)
+    for name, of in errors.items():
+        result["orientation"][name] = _orientation_row(of.error, of.covariance)
     result["poses_left_out"] = poses_left_out(flight)
     intersections = intersect_points(flight)
     rows = {**intersections, **_adjusted(flight)}
@@ -246,8 +246,25 @@ def poses_left_out(flight: Flight) -> dict[str, int]:
     return {name: n for name, n in counts.items() if n}
 
 
-def orientation_errors(flight: Flight) -> dict[str, tuple[NDArray[np.int64], Array, Array]]:
-    """Time (n,), error estimate minus truth (n, 6) in m and rad, and stated covariance (n, 6, 6), by name.
+class OrientationErrors(NamedTuple):
+    """Errors of one kind of orientation: estimate minus truth.
+
+    Attributes
+    ----------
+    time_ns : (n,) UTC
+    error : (n, 6) m and rad
+    covariance : (n, 6, 6) as stated
+    strip : (n,) "" where none is named
+    """
+
+    time_ns: NDArray[np.int64]
+    error: Array
+    covariance: Array
+    strip: NDArray[np.str_]
+
+
+def orientation_errors(flight: Flight) -> dict[str, OrientationErrors]:
+    """Errors of the orientation, by name.
 
     Valid samples on strips, in the time the final orientation covers, so that all rows are of the same times.
     """
@@ -262,7 +279,7 @@ def orientation_errors(flight: Flight) -> dict[str, tuple[NDArray[np.int64], Arr
         poses = poses.take(poses.valid)
         true = true_path.at(flight.seconds(poses.time_ns))
         error = np.hstack([poses.position_l - true.position_l, angle_difference(poses.angles, true.angles)])
-        result[name] = poses.time_ns, error, poses.covariance
+        result[name] = OrientationErrors(poses.time_ns, error, poses.covariance, poses.strip)
     return result
 
 
@@ -350,7 +367,7 @@ def intersect_points(flight: Flight) -> dict[str, tuple[list[str], Array, Array]
     if usable is None:
         return {}
     ids, rays, refined = usable
-    corrections = {name: _corrections(flight, pose, rays.time_s) for name, pose in INTERSECTED.items()}
+    corrections = {name: _corrections(flight, pose, rays) for name, pose in INTERSECTED.items()}
     common = np.ones(len(rays.time_s), dtype=bool)
     for found in corrections.values():
         if found is not None:
@@ -373,13 +390,25 @@ def intersect_points(flight: Flight) -> dict[str, tuple[list[str], Array, Array]
     return result
 
 
-def _corrections(flight: Flight, name: str, time_s: Array) -> tuple[Array, Array] | None:
+def _corrections(flight: Flight, name: str, rays: ImageRays) -> tuple[Array, Array] | None:
     """Correction to the filtered orientation (n, 6), NaN where not covered or beside a pose that is not valid, and
-    covariance (n, 6, 6) at ray times."""
-    filtered = flight.poses[flight.measured]
-    poses = flight.poses.get(name) if name else filtered
+    covariance (n, 6, 6) at the times of rays, of the strip that each of them is in."""
+    poses = flight.poses.get(name or flight.measured)
     if poses is None or len(poses) < 2:
         return None
+    if not poses.is_of_several_strips:
+        return _correction_at(flight, poses, rays.time_s)
+    correction, covariance = np.full((len(rays.time_s), 6), np.nan), np.full((len(rays.time_s), 6, 6), np.nan)
+    for number, strip in enumerate(flight.strips):
+        inside, own = rays.strip == number, poses.of(strip)
+        if inside.any() and len(own) >= 2:
+            correction[inside], covariance[inside] = _correction_at(flight, own, rays.time_s[inside])
+    return correction, covariance
+
+
+def _correction_at(flight: Flight, poses: PoseSeries, time_s: Array) -> tuple[Array, Array]:
+    """The same at any times, by poses of one strip after the other."""
+    filtered = flight.poses[flight.measured]
     t = flight.seconds(poses.time_ns)
     nearest = np.clip(np.searchsorted(t, time_s), 0, len(t) - 1)
     before = np.clip(nearest - 1, 0, len(t) - 1)

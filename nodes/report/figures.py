@@ -27,6 +27,7 @@ SCALE = np.array([1.0, 1.0, 1.0, MDEG, MDEG, MDEG])
 _TELLING = 30  # redundancy from which sigma0 is shown
 _NARROWEST = 0.1  # of the map's length is its width at least, also of a straight flight
 _NAME = 12  # letters of a strip on the map
+_SAME_PLACE, _MOST_NAMES = 0.01, 3  # strips that begin closer than this share of the map are named together, so many
 _MOST_ARROWS = 300  # residuals of a CCD line that are drawn; arrows of more would cover each other
 _SIGMAS = 3.0
 
@@ -79,6 +80,8 @@ def trajectory_map(flight: Flight) -> Figure | None:
 
 
 def _strips(ax: Axes, flight: Flight, poses: PoseSeries, place: Any) -> None:
+    named: list[tuple[Array, list[str]]] = []  # place of a name, and the strips that begin there
+    near = _SAME_PLACE * float(np.ptp(poses.position_l[:, :2], axis=0).max()) / 1000
     for k, id in enumerate(flight.strips):
         span = flight.strip_times(id)
         if span is None:
@@ -90,9 +93,15 @@ def _strips(ax: Axes, flight: Flight, poses: PoseSeries, place: Any) -> None:
         x, y = place(poses.position_l[inside])
         ax.plot(x, y, color="#34495e", lw=2.4, solid_capstyle="butt", label="strip" if k == 0 else None)
         ax.annotate("", (x[-1], y[-1]), (x[-2], y[-2]), arrowprops={"arrowstyle": "-|>", "color": "#34495e", "lw": 2})
-        text = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center", "color": "#34495e", "weight": "bold"}
-        above = {"zorder": 7, "bbox": {"color": "white", "alpha": 0.6, "pad": 0.5, "lw": 0}}  # legible among points
-        ax.annotate(shortened(id, _NAME), (x[0], y[0]), **text, **above)
+        begin = np.array([x[0], y[0]])
+        there = next((ids for at, ids in named if np.hypot(*(at - begin)) <= near), None)
+        if there is None:
+            named.append((begin, there := []))
+        there.append(shortened(id, _NAME))
+    text = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center", "color": "#34495e", "weight": "bold"}
+    above = {"zorder": 7, "bbox": {"color": "white", "alpha": 0.6, "pad": 0.5, "lw": 0}}  # legible among points
+    for at, ids in named:
+        ax.annotate(", ".join(ids[:_MOST_NAMES]) + (", …" if len(ids) > _MOST_NAMES else ""), at, **text, **above)
 
 
 def _misfits(ax: Axes, flight: Flight, place: Any, length_km: float, turned: bool) -> None:
@@ -278,9 +287,10 @@ def correction_functions(flight: Flight) -> Figure | None:
     axis = StripTime(flight)
     t = flight.seconds(final.time_ns)
     values = corrections_of(flight, final) * SCALE
-    curves = [("final", t, values, FINAL, 1.6)]
+    curves = [("final", t, values, final.strip, FINAL, 1.6)]
     if live is not None:
-        curves.insert(0, ("live", flight.seconds(live.time_ns), corrections_of(flight, live) * SCALE, LIVE, 0.9))
+        of_live = corrections_of(flight, live) * SCALE
+        curves.insert(0, ("live", flight.seconds(live.time_ns), of_live, live.strip, LIVE, 0.9))
     if truth is not None and len(truth) >= 2:
         path = truth.trajectory(flight.start_ns)
         known = path.covers(t) & truth.known_at(final.time_ns)
@@ -288,15 +298,16 @@ def correction_functions(flight: Flight) -> Figure | None:
         error = np.hstack(
             [final.position_l[known] - true.position_l, angle_difference(final.angles[known], true.angles)]
         )
-        curves.insert(0, ("true", t[known], values[known] - error * SCALE, TRUTH, 1.0))
+        curves.insert(0, ("true", t[known], values[known] - error * SCALE, final.strip[known], TRUTH, 1.0))
     sigma = np.sqrt(np.diagonal(final.covariance, axis1=1, axis2=2)) * SCALE
     for i, ax in enumerate(axes.T.ravel()):
         band = axis.curve(
-            t, np.stack([values[:, i] - _SIGMAS * sigma[:, i], values[:, i] + _SIGMAS * sigma[:, i]], axis=1)
-        )
+            t, np.stack([values[:, i] - _SIGMAS * sigma[:, i], values[:, i] + _SIGMAS * sigma[:, i]], axis=1),
+            named=final.strip,
+        )  # fmt: skip
         ax.fill_between(band[0], band[1][:, 0], band[1][:, 1], color="#bfe3cd", lw=0, label="final ± 3σ")
-        for name, time, columns, color, width in curves:
-            x, y = axis.curve(time, columns[:, i : i + 1])
+        for name, time, columns, strip, color, width in curves:
+            x, y = axis.curve(time, columns[:, i : i + 1], named=strip)
             style = (0, (4, 2)) if name == "true" else "-"
             ax.plot(x, y[:, 0], color=color, lw=width, ls=style, label=name, zorder=4 if name == "true" else 3)
         ax.axhline(0, color="#777777", lw=0.6)
@@ -319,9 +330,9 @@ def errors(flight: Flight) -> Figure | None:
     for i, ax in enumerate(axes.T.ravel()):
         span = 0.0
         if reference is not None:
-            time, error, covariance = found[reference]
+            time, error, covariance, strip = found[reference]
             sigma = _SIGMAS * SCALE[i] * np.sqrt(covariance[:, i, i])
-            x, band = axis.curve(flight.seconds(time), sigma[:, None])
+            x, band = axis.curve(flight.seconds(time), sigma[:, None], named=strip)
             ax.fill_between(x, -band[:, 0], band[:, 0], color="#bfe3cd", lw=0, label=f"± 3σ of {reference}")
             stated = sigma[np.isfinite(sigma)]
             span = max(
@@ -329,8 +340,8 @@ def errors(flight: Flight) -> Figure | None:
             )
         for name, (color, width) in styles.items():
             if name in found:
-                time, error, _ = found[name]
-                x, y = axis.curve(flight.seconds(time), SCALE[i] * error[:, i])
+                time, error, _, strip = found[name]
+                x, y = axis.curve(flight.seconds(time), SCALE[i] * error[:, i], named=strip)
                 ax.plot(x, y, color=color, lw=width, label=name)
                 span = max(span, SCALE[i] * float(np.percentile(np.abs(error[:, i]), 90)))
         ax.axhline(0, color="#777777", lw=0.6)

@@ -49,7 +49,7 @@ def in_gap(known_ns: NDArray[np.int64], time_ns: NDArray[np.int64]) -> NDArray[n
 
 @dataclass(frozen=True)
 class PoseSeries:
-    """Orientation over time, in order of time; n samples.
+    """Orientation over time, in order of time; n samples, several of a time where strips are imaged at the same time.
 
     Attributes
     ----------
@@ -76,6 +76,15 @@ class PoseSeries:
         """A selection by index or mask."""
         return PoseSeries(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
+    @property
+    def is_of_several_strips(self) -> bool:
+        """Whether there are several samples of a time."""
+        return bool((np.diff(self.time_ns) == 0).any())
+
+    def of(self, strip: str) -> PoseSeries:
+        """The samples that name a strip, or none."""
+        return self.take((self.strip == strip) | (self.strip == ""))
+
     def known_at(self, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether times (n,) lie between neighbours of this series and not in a gap of it."""
         return ~in_gap(self.time_ns, time_ns)
@@ -87,7 +96,8 @@ class PoseSeries:
 
     def trajectory(self, start_ns: int) -> Trajectory:
         """Interpolator over seconds since ``start_ns``; raises ValueError for fewer than two samples."""
-        return Trajectory((self.time_ns - start_ns) / SECOND_NS, self.position_l, self.quaternion)
+        time_ns, first = np.unique(self.time_ns, return_index=True)
+        return Trajectory((time_ns - start_ns) / SECOND_NS, self.position_l[first], self.quaternion[first])
 
 
 @dataclass(frozen=True)
@@ -406,11 +416,9 @@ def _finite(body: Any, *values: float) -> Any:
 
 
 def _poses(samples: list[convert.PoseSample], keep_first: bool) -> PoseSeries:
-    """Samples in order of time; of two at the same time the first or the last is kept."""
-    time = np.array([s.time_ns for s in samples], dtype=np.int64)
-    ordered = samples if keep_first else samples[::-1]
-    _, index = np.unique(time if keep_first else time[::-1], return_index=True)
-    kept = [ordered[i] for i in index]
+    """Samples in order of time; of two of a strip at the same time the first or the last is kept."""
+    of = {(s.time_ns, s.strip): s for s in (samples[::-1] if keep_first else samples)}
+    kept = [of[key] for key in sorted(of)]
     none6, none66 = np.full(6, np.nan), np.full((6, 6), np.nan)
     quaternion = np.array([s.quaternion for s in kept])
     return PoseSeries(

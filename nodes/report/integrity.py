@@ -113,7 +113,7 @@ def levels(flight: Flight) -> tuple[Array, Array, Array, Array] | None:
 
     Errors are NaN where there is no truth, or no live orientation of about that time.
     """
-    rows = [(stamp, r.protection, r.sigma) for stamp, r in flight.reports if r.strip]
+    rows = [(stamp, r.protection, r.sigma, r.strip) for stamp, r in flight.reports if r.strip]
     rows = [row for row in rows if len(row[1]) == len(row[2]) == 6 and np.isfinite([*row[1], *row[2]]).all()]
     if not rows:
         return None
@@ -121,13 +121,21 @@ def levels(flight: Flight) -> tuple[Array, Array, Array, Array] | None:
     protection, sigma = (np.array([row[k] for row in rows], dtype=float) for k in (1, 2))
     error = np.full((len(rows), 6), np.nan)
     live = orientation_errors(flight).get("live")
-    if live is not None and len(live[0]):
-        nearest = np.clip(np.searchsorted(live[0], stamps), 1, len(live[0]) - 1) if len(live[0]) > 1 else stamps * 0
-        if len(live[0]) > 1:
-            nearest -= stamps - live[0][nearest - 1] < live[0][nearest] - stamps
-        near = np.abs(live[0][nearest] - stamps) <= _NEAR_S * convert.SECOND_NS
-        error[near] = live[1][nearest[near]]
+    strips = np.array([row[3] for row in rows])
+    for strip in np.unique(strips) if live is not None else ():
+        own, of_strip = strips == strip, (live.strip == strip) | (live.strip == "")
+        if of_strip.any():
+            error[own] = _errors_at(stamps[own], live.time_ns[of_strip], live.error[of_strip])
     return flight.seconds(stamps), protection, sigma, error
+
+
+def _errors_at(stamps: NDArray[np.int64], time_ns: NDArray[np.int64], error: Array) -> Array:
+    """Errors (n, 6) at the times (k,) that are nearest to stamps (n,); NaN where none of them is near."""
+    nearest = np.clip(np.searchsorted(time_ns, stamps), 1, len(time_ns) - 1) if len(time_ns) > 1 else stamps * 0
+    if len(time_ns) > 1:
+        nearest -= stamps - time_ns[nearest - 1] < time_ns[nearest] - stamps
+    near = np.abs(time_ns[nearest] - stamps) <= _NEAR_S * convert.SECOND_NS
+    return np.where(near[:, None], error[nearest], np.nan)
 
 
 def _sources(flight: Flight, lit: list[tuple[int, Any]], lasting: list[float]) -> list[dict[str, Any]]:
@@ -199,7 +207,7 @@ def _lights(flight: Flight) -> tuple[Array, Array]:
     code = np.array([LIGHTS.index(r.light) if r.light in LIGHTS else -1 for _, r in lit], dtype=float)
     time_s = np.atleast_1d(flight.seconds(np.array([stamp for stamp, _ in lit], dtype=np.int64)))
     ends = time_s + _lasting(flight, lit)
-    last = np.append(time_s[1:] > ends[:-1] + 1e-6, True)
+    last = np.append(time_s[1:] > ends[:-1] + 1e-6, True)[: len(time_s)]  # none without a light
     places = np.flatnonzero(last) + 1
     return np.insert(time_s, places, ends[last]), np.insert(code, places, -1.0)
 

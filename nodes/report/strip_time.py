@@ -41,21 +41,29 @@ class StripTime:
             place += end - start + gap
         self._gap, self._length = gap, max(place, 1e-9)
 
-    def curve(self, time_s: Array, values: Array, pause_s: float = _PAUSE_S) -> tuple[Array, Array]:
+    def curve(
+        self, time_s: Array, values: Array, pause_s: float = _PAUSE_S, named: NDArray[np.str_] | None = None
+    ) -> tuple[Array, Array]:
         """Places and values of a thinned-out curve; NaN where its data pause for longer than ``pause_s``, so that no
-        line crosses a pause."""
-        step = max(1, len(time_s) // _SAMPLES)
-        t, v = np.asarray(time_s, dtype=float)[::step], np.asarray(values, dtype=float)[::step]
+        line crosses a pause.
+
+        ``named`` are the strips of the data, "" for what is of none: of strips that are imaged at the same time each
+        shows its own, and what is of none.
+        """
+        t, v = np.asarray(time_s, dtype=float), np.asarray(values, dtype=float)
         if self.strips:
-            x = np.full(len(t), np.nan)
-            for start, end, place, _ in self.strips:
+            parts = []
+            for start, end, _, id in self.strips:
                 inside = (t >= start) & (t <= end)
-                x[inside] = t[inside] - start + place
-            kept = np.isfinite(x)
-            t, v, x = t[kept], v[kept], x[kept]
+                parts.append(np.flatnonzero(inside if named is None else inside & ((named == id) | (named == ""))))
+            shift = np.repeat([place - start for start, _, place, _ in self.strips], [len(part) for part in parts])
+            shown = np.concatenate(parts)
         else:
-            x = t
-        pauses = np.flatnonzero(np.diff(t) > max(pause_s, _PAUSE_S)) + 1
+            shift, shown = np.zeros(len(t)), np.arange(len(t))
+        step = max(1, len(shown) // _SAMPLES)
+        t, v, shift = t[shown][::step], v[shown][::step], shift[::step]
+        x = t + shift
+        pauses = np.flatnonzero((np.diff(t) > max(pause_s, _PAUSE_S)) | (np.diff(shift) != 0)) + 1
         return np.insert(x, pauses, np.nan), np.insert(v, pauses, np.nan, axis=0)
 
     def dress(self, axes: Iterable[Axes], lowest: Iterable[Axes]) -> None:

@@ -87,7 +87,7 @@ def test_errors_beyond_the_protection_level_are_counted(messages):
     assert said["compared"] > 20 and said["exceeded"][:5] == [0] * 5
     assert 0.3 * said["compared"] < said["exceeded"][5] < said["compared"]  # half a sigma holds 38 % of normal errors
     # against the errors themselves, at the reports' own times
-    time_ns, error, _ = orientation_errors(flight)["live"]
+    time_ns, error, *_ = orientation_errors(flight)["live"]
     t, _, _, matched = found
     for k in np.flatnonzero(np.isfinite(matched[:, 0]))[::7]:
         nearest = np.argmin(np.abs(flight.seconds(time_ns) - t[k]))
