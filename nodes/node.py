@@ -60,6 +60,7 @@ class Node:
         self.counters: Counter[str] = Counter()
         self.last_problem = ""  # the newest
         self.last_problems: dict[str, str] = {}  # the newest of each kind
+        self.refusals = 0  # messages of which nothing could be used
         self.alarms: dict[str, str] = {}  # what an operator has to look at now, by kind; runners set some of them
 
     def step(self, message: Message) -> Iterable[Message]:
@@ -104,4 +105,13 @@ class Node:
         A kind is a short counter name, one of few that the program knows and never made of the data.
         """
         self.counters[kind] += 1
+        self.keep_problem(kind, text)
+
+    def keep_problem(self, kind: str, text: str) -> None:
+        """Keep one line about the newest case of a kind that is counted elsewhere."""
         self.last_problem = self.last_problems[kind] = shortened(text)
+
+    def refuse(self, kind: str, text: str) -> None:
+        """Count a message of which nothing can be used as bad data of a kind."""
+        self.refusals += 1
+        self.problem(kind, text)

@@ -52,6 +52,7 @@ class TopicCounts:
     late: int = 0
     malformed: int = 0
     dropped: int = 0
+    refused: int = 0  # by the node; those that are malformed come to it for a status
 
 
 @dataclass

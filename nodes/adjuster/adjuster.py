@@ -23,7 +23,7 @@ from .elevation import Elevation
 from .outputs import AdjusterOutputs, log
 from .pace import LOSSLESS, PARTS, Pace, Pacing, pace_message
 from .stated_control import StatedControl
-from .strips import NOT_IMAGED, AdjustedStrips
+from .strips import GOES_ON, NOT_IMAGED, AdjustedStrips
 
 #: Image sigma where neither measurement nor project gives one, px.
 DEFAULT_IMAGE_SIGMA_PX = 0.3
@@ -197,7 +197,7 @@ class Adjuster(Node):
             outputs += self._take(message)
             outputs += self._update_for_waiting(message.stamp_ns)
         except ValueError as error:
-            self.problem("malformed", f"{message.topic}: {error}")
+            self.refuse("malformed", f"{message.topic}: {error}")
         return outputs
 
     def behind(self, lag_s: float, now_s: float, busy_s: float) -> Iterable[Message]:
@@ -376,7 +376,7 @@ class Adjuster(Node):
     def _tie_came(self, body: Any, source: str, stamp_ns: int) -> None:
         """Take a tie point, or let it wait for the choice."""
         if self._window is None:
-            self.problem("before configuration", "observation/tie came before configuration/project and camera")
+            self.refuse("before configuration", "observation/tie came before configuration/project and camera")
             return
         if not self._rays_waiting:
             self._waiting_since_ns = stamp_ns
@@ -406,20 +406,28 @@ class Adjuster(Node):
             self._strips.held_ties.append((body, source))
             return
         sigma, now_s = self._project.image_sigma_px or DEFAULT_IMAGE_SIGMA_PX, self._seconds(self._stamp_ns)
+        used = False
         for image in body.images:
             look = Look(
                 image.strip, image.ccd, image.line, image.sample, image.sigma_line or sigma,
                 image.sigma_sample or sigma, source, self._seconds(image.time_ns) if image.time_ns else np.nan,
             )  # fmt: skip
             if body.point:
-                if self._strips.add_look(body.point, look, now_s, self._window) == NOT_IMAGED:
+                reason = self._strips.add_look(body.point, look, now_s, self._window)
+                if reason == NOT_IMAGED:
                     self._outputs.refusals.append(Refusal(body.point, look, NOT_IMAGED))
             else:
-                self._outputs.refusals.append(Refusal("", look, "point without a name"))
+                reason = "point without a name"
+                self._outputs.refusals.append(Refusal("", look, reason))
+            used |= reason in GOES_ON
+            if reason not in GOES_ON:
+                where = f"strip {look.strip!r}, CCD line {look.ccd!r}, line {look.line:.6g}, sample {look.sample:.6g}"
+                self.keep_problem(reason, f"observation/tie: point {body.point!r} in {where}")
+        self.refusals += not used
 
     def _pose(self, body: Any, smoothed: bool, stamp_ns: int) -> list[Message]:
         if self._window is None:
-            self.problem("before configuration", "a pose came before configuration/project and camera")
+            self.refuse("before configuration", "a pose came before configuration/project and camera")
             return []
         pose = convert.plain_pose(body)
         ahead_s = (pose.time_ns - stamp_ns) * 1e-9

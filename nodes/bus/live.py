@@ -285,14 +285,16 @@ class BusRunner:
         self._hear(message.topic)
         if message.topic == "configuration/strip":
             self._open_strip = "" if message.body.ended else message.body.id
-        failed, refused = self.node.counters["failed"], self.node.counters["malformed"]
+        failed, malformed, refusals = self.node.counters["failed"], self.node.counters["malformed"], self.node.refusals
         begun = time.monotonic()
         with self._lock:  # queries are answered between steps
             outputs = self._driver.step(message)
         last = self.node.last_problems
+        if self.node.counters["failed"] > failed or self.node.refusals > refusals:
+            self._check.counts[message.topic].refused += 1
         if self.node.counters["failed"] > failed:
             self._report(f"{self.node.name}: {last['failed']}")
-        if self.node.counters["malformed"] > refused == 0:
+        if self.node.counters["malformed"] > malformed == 0:
             self._report(f"{self.node.name}: {last['malformed']}")
         for output in outputs:
             self._publish(output)

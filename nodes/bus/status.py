@@ -87,6 +87,7 @@ class StatusPublisher:
             status.topics.add(
                 topic=topic, received=c.received, gaps=c.gaps, duplicates=c.duplicates, late=c.late,
                 malformed=c.malformed + extra.get(topic, 0), dropped=c.dropped, rate_hz=rate,
+                refused=c.malformed + c.refused,
             )  # fmt: skip
         for name, value in sorted(node.counters.items()):
             status.counters.add(name=name, value=int(value), last_problem=node.last_problems.get(name, ""))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import sys
 import threading
 import time
 from datetime import UTC, datetime
@@ -21,7 +22,9 @@ from ..formats.json_text import json_text
 from ..last_problems import last_of
 from ..monitor.sensor_watch import SensorWatch
 from ..ordering import MAX_JUMP_NS
+from ..terminal import plain
 from .live_flight import DRAIN_S, ESTIMATORS, LiveFlight, add_view_arguments, seconds_between
+from .refused import refused_inputs
 
 if TYPE_CHECKING:
     from ..bus.session import Bus
@@ -78,7 +81,9 @@ def run(args: argparse.Namespace) -> int:
         print(json_text(result))
     else:
         print(live.summary(result))
-    return 1 if "no_report" in result else 0
+    for text in result["refused"]:
+        print(f"triline fly: {args.flight}: {plain(text)}", file=sys.stderr)
+    return 1 if "no_report" in result or result["refused"] else 0
 
 
 class FirstData:
@@ -302,7 +307,9 @@ class Fly(LiveFlight):
         if not any(row.received for row in rows):
             raise UserError(f"no sensor data came in on triline/{self.platform}; never seen: {', '.join(missing)}")
         result = super()._evaluate()
-        return {**result, "sensors": {row.name: row.received for row in rows}, "never_seen": missing}
+        refused = refused_inputs(self._overview.nodes, self.estimators)
+        sensors = {row.name: row.received for row in rows}
+        return {**result, "sensors": sensors, "never_seen": missing, "refused": refused}
 
     def remarks(self, result: dict[str, Any]) -> list[str]:
         came = ", ".join(f"{name} {n}" for name, n in result["sensors"].items() if n)

@@ -155,7 +155,7 @@ class Matcher(Node):
                 out += self._find_strip(message.body)
             out += self._take(message)
         except ValueError as error:
-            self.problem("malformed", f"{message.topic}: {error}")
+            self.refuse("malformed", f"{message.topic}: {error}")
         return out
 
     def finish(self) -> Iterable[Message]:
@@ -360,7 +360,7 @@ class Matcher(Node):
     def _lines(self, ccd: str, block: LineBlock) -> list[Message]:
         matcher = self._matcher
         if matcher is None:
-            self.problem("before configuration", f"lines of {ccd} came before configuration/camera")
+            self.refuse("before configuration", f"sensor/lines/{ccd} came before configuration/camera")
             return []
         if block.ccd and block.ccd != ccd:
             raise ValueError(f"a block of CCD line {block.ccd!r}")

@@ -120,7 +120,7 @@ class Navigator(Node):
             else:
                 return self._configure(message)
         except ValueError as error:
-            self.problem("malformed", f"{message.topic}: {error}")
+            self.refuse("malformed", f"{message.topic}: {error}")
             return ()
         return self._messages(poses)
 
@@ -239,7 +239,7 @@ class Navigator(Node):
 
     def _inertial(self, body: Any) -> list[NavigationPose]:
         if self._engine is None:
-            self.problem("before configuration", "sensor/imu came before configuration/project")
+            self.refuse("before configuration", "sensor/imu came before configuration/project")
             return []
         self._note_time(body.time_ns, "inertial")
         force, rate = (body.force_x, body.force_y, body.force_z), (body.rate_x, body.rate_y, body.rate_z)
@@ -265,7 +265,7 @@ class Navigator(Node):
 
     def _attitude(self, body: Any) -> list[NavigationPose]:
         if self._engine is None:
-            self.problem("before configuration", "sensor/attitude came before configuration/project")
+            self.refuse("before configuration", "sensor/attitude came before configuration/project")
             return []
         if isinstance(self._engine, InertialNavigator):
             self.counters["attitude beside inertial data"] += 1
@@ -307,7 +307,7 @@ class Navigator(Node):
     def _gnss(self, message: Message) -> list[NavigationPose]:
         body = message.body
         if self._engine is None:
-            self.problem("before configuration", "sensor/gnss came before configuration/project")
+            self.refuse("before configuration", "sensor/gnss came before configuration/project")
             return []
         convert.check_place(body.latitude, body.longitude, body.altitude)
         geodetic = np.array([body.latitude, body.longitude, body.altitude])
@@ -315,6 +315,7 @@ class Navigator(Node):
         if covariance.shape != (9,) or not np.isfinite(covariance).all() or covariance[::4].min() <= 0:
             raise ValueError("position covariance: wanted 9 values with a positive diagonal")
         if not self._right_clock(message):
+            self.refusals += 1
             return []
         self._check_time(message)
         frame = self._frame
@@ -325,6 +326,7 @@ class Navigator(Node):
         velocity_l, velocity_covariance_l = self._velocity(body, R_l_enu)
         fix = local_fix(frame, time_s, antenna_l, covariance_l, velocity_l, velocity_covariance_l)
         if not self._in_step(fix):
+            self.refusals += 1
             return []
         if isinstance(self._engine, KinematicFilter):
             return self._engine.add_gnss(time_s, antenna_l, covariance_l)

@@ -115,7 +115,7 @@ class Rectifier(Node):
         try:
             self._take(message)
         except ValueError as error:
-            self.problem("malformed", f"{message.topic}: {error}")
+            self.refuse("malformed", f"{message.topic}: {error}")
         if self._stamp_ns < self._next_publish_ns:
             return ()
         self._next_publish_ns = self._stamp_ns + self._publish_ns
@@ -201,7 +201,7 @@ class Rectifier(Node):
 
     def _lines(self, ccd: str, block: LineBlock) -> None:
         if self._camera is None or self._frame is None:
-            self.problem("before configuration", f"lines of {ccd} came before configuration")
+            self.refuse("before configuration", f"sensor/lines/{ccd} came before configuration")
             return
         if self._line < 0:
             self._choose_line(self._camera)

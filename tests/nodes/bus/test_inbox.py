@@ -83,11 +83,12 @@ def test_a_node_that_only_looks_on_slows_nobody():
 
 
 class Refuses(Slow):
-    """Can use nothing that comes."""
+    """Can use no attitude that comes."""
 
     def step(self, message: Message):
         self.seen.append(message)
-        self.problem("malformed", f"{message.topic}: no. {len(self.seen)} by design")
+        if message.topic == "sensor/attitude":
+            self.refuse("malformed", f"{message.topic}: no. {len(self.seen)} by design")
         return ()
 
 
@@ -98,4 +99,7 @@ def test_what_a_node_refuses_first_is_written_to_its_log():
         runner = BusRunner(Refuses(), bus, said.append)
         for number in range(3):
             runner._work(sample.message("sensor/attitude", number))
+            runner._work(sample.message("sensor/lines/N", number))
+        counts = runner._statistics()
     assert said == ["slow: sensor/attitude: no. 1 by design"]
+    assert counts["sensor/attitude"].refused == 3 and "sensor/lines/N" not in counts  # which were of use

@@ -85,24 +85,30 @@ def driven(tmp_path_factory):
 def flown(request, driven, tmp_path_factory):
     """The same flight by each of the programs in the documentation."""
     folder = tmp_path_factory.mktemp("fly")
-    port, stream_port = str(free_port()), str(free_port())
+    stream_port = str(free_port())
     shutil.copytree(driven, folder, dirs_exist_ok=True)
     if request.param is publish_in_c:
         with open(folder / "flight" / "flight.toml", "a") as file:
             file.write(f'[[sensor]]\nkind = "stream"\naddress = "listen://127.0.0.1:{stream_port}"\n')
-    out = folder / "out"
+    code, said = fly(folder, request.param, stream_port)
+    assert code == 0, said
+    return Flown(folder / "flight", folder / "drivers", folder / "out", said)
+
+
+def fly(folder, publish, stream_port=""):
+    """Fly what drivers have measured; exit code and what was said."""
+    port, out = str(free_port()), folder / "out"
     command = [*TRILINE, "fly", str(folder / "flight"), "--no-viewer", "--no-report", "--port", port]
     command += ["--nodes", "navigator,matcher,adjuster", "-o", str(out)]
     fly = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=ENVIRONMENT)
     try:
         said = wait_for_line(fly, "waiting for sensors on triline/driven/sensor")
-        request.param(folder / "drivers", port, stream_port)
+        publish(folder / "drivers", port, stream_port)
         fly.send_signal(signal.SIGINT)
         rest, _ = fly.communicate(timeout=300)
     finally:
         fly.kill()
-    assert fly.returncode == 0, rest
-    return Flown(folder / "flight", folder / "drivers", out, "".join(said) + rest)
+    return fly.returncode, "".join(said) + rest
 
 
 def test_the_publisher_imports_nothing_of_triline():
@@ -154,3 +160,15 @@ def test_process_gives_the_bytes_of_the_live_results(flown, tmp_path):
             pytest.skip("the machine was so busy that nodes got messages after their turn")
         assert live == processed, topic
         assert len(live) > (1 if topic == "configuration/strip" else 10), topic
+
+
+def test_a_flight_whose_image_lines_are_all_refused_ends_with_exit_code_1(driven, tmp_path):
+    """A camera.json of other pixels than the camera has: nothing was tied, and a script took that for a good flight."""
+    shutil.copytree(driven, tmp_path, dirs_exist_ok=True)
+    for path in (tmp_path / "drivers").glob("lines_*.npy"):
+        np.save(path, np.load(path)[:, :-10])
+    code, said = fly(tmp_path, publish_in_python)
+    (line,) = (text for text in said.splitlines() if text.startswith("triline fly: "))
+    assert line.startswith(f"triline fly: {tmp_path}/flight: matcher used none of the ")
+    assert " messages on sensor/lines/*: malformed: sensor/lines/" in line and "of 90 samples, wanted 100" in line
+    assert code == 1 and (tmp_path / "out" / "flight.mcap").exists()
