@@ -14,6 +14,7 @@ from ...schemas.image_lines import LineBlock
 from ...schemas.topics import CONFIGURATION, POSES
 from ...solver.camera.line_camera import LineCamera
 from ...solver.geometry.frames import LocalFrame
+from ...solver.geometry.rotation import matrix_from_angles
 from ...solver.matching.line_quality import full_scale_of
 from ...solver.orthoimage.ground_grid import GroundGrid
 from ...solver.orthoimage.growing import GrowingOrthoimage, WaitingLines
@@ -22,6 +23,7 @@ from ...solver.orthoimage.strip import rays_of
 from ...solver.orthoimage.surface import Ellipsoid, Surface
 from .. import convert
 from ..node import Message, Node
+from .steepest import SteepestLine
 
 #: Lines of the live orthoimage wait so long for live orientation, s.
 LIVE_PATIENCE_S = 1.0
@@ -37,6 +39,9 @@ class Rectifier(Node):
 
     The ground is the relief between the adjusted object points; before there are enough of them, a height. The camera
     is that of the orientations: with the parameters that the adjuster has estimated, as its reports say.
+
+    Of several lenses, of which the camera does not say where each looks, one is shown until lines of another come that
+    its poses show to look down more steeply.
 
     Parameters
     ----------
@@ -93,6 +98,8 @@ class Rectifier(Node):
 
     def _begin_again(self) -> None:
         self._line = -1
+        self._steepest: SteepestLine | None = None
+        self._notes: list[Message] = []
         self._factor = 1
         self._next_line: dict[str, int] = {}
         self._rest: WaitingLines | None = None
@@ -102,6 +109,7 @@ class Rectifier(Node):
         self._surface: Surface | None = None
         self._mean_m = 0.0
         self._parameters: Any = None  # of the newest report, as long as they have not been followed
+        self._followed: Any = None
         self._filtered_seen = False
         self.images = {
             "live": GrowingOrthoimage(LIVE_PATIENCE_S, self._budget),
@@ -116,11 +124,12 @@ class Rectifier(Node):
             self._take(message)
         except ValueError as error:
             self.refuse("malformed", f"{message.topic}: {error}")
+        notes, self._notes = self._notes, []
         if self._stamp_ns < self._next_publish_ns:
-            return ()
+            return notes
         self._next_publish_ns = self._stamp_ns + self._publish_ns
         self._work()
-        return self._changed_tiles()
+        return notes + self._changed_tiles()
 
     def finish(self) -> Iterable[Message]:
         self._work(everything=True)
@@ -205,10 +214,12 @@ class Rectifier(Node):
             return
         if self._line < 0:
             self._choose_line(self._camera)
+        if ccd not in self._camera.line_index:
+            raise ValueError(f"unknown CCD line {ccd!r}")
+        if self._steepest is not None and self._steepest.wants(self._camera.line_index[ccd]):
+            self._look_down(self._camera, self._steepest, ccd, block)
         line = self._camera.lines[self._line]
         if ccd != line.id:
-            if ccd not in self._camera.line_index:
-                raise ValueError(f"unknown CCD line {ccd!r}")
             return
         if block.strip not in self._strips:
             self._unknown.append((self._stamp_ns, replace(block, ccd=ccd)))
@@ -233,8 +244,37 @@ class Rectifier(Node):
                 raise ValueError(f"ccd: the camera has no line {self._ccd!r}")
             self._line = camera.line_index[self._ccd]
         else:
-            self._line = camera.line_index[camera.nadir_line.id]
+            self._steepest = SteepestLine(camera)
+            self._line = self._steepest.line
         self._factor = -(-camera.lines[self._line].pixels // self._samples)
+
+    def _look_down(self, camera: LineCamera, steepest: SteepestLine, ccd: str, block: LineBlock) -> None:
+        """Look at the first orientation of a lens, and show its lines from now on where they look down more steeply."""
+        measured, time_s = self.images["live"].measured, self._seconds(int(block.times_ns()[0]))
+        if not measured.covers([time_s])[0]:
+            return  # the next block of it
+        pose = measured.at([time_s]).poses
+        tilts = steepest.see(
+            camera.line_index[ccd], block.strip, pose.position_l[0], matrix_from_angles(*pose.angles[0])
+        )
+        if tilts is None:
+            return
+        before = camera.lines[self._line].id
+        self._line, self._rest = steepest.line, None
+        self._next_line.clear()
+        self._factor = -(-camera.lines[self._line].pixels // self._samples)
+        self._parameters = self._parameters or self._followed
+        for image in self.images.values():
+            image.look_with(rays_of(camera, self._line, factor=self._factor))
+        if np.isfinite(tilts[0]):
+            was, now = np.degrees(tilts)
+            text = (
+                f"CCD line {ccd} looks down more steeply than {before} ({now:.1f} and {was:.1f} deg off): "
+                "the orthoimage shows it from now on"
+            )
+            body = m.Log(name=self.name, message=text, level=m.Log.INFO)
+            convert.set_time(body.timestamp, self._stamp_ns)
+            self._notes.append(Message("event/log", self._stamp_ns, body))
 
     def _reduced(self, lines: WaitingLines) -> None:
         """Put pixels together and hand lines on; what does not fill a group waits for the next block."""
@@ -304,7 +344,8 @@ class Rectifier(Node):
         """Rectify with the camera that the adjuster has estimated from now on."""
         if self._parameters is None or any(image.grid is None for image in self.images.values()):
             return
-        told, self._parameters = self._parameters, None
+        told = self._followed = self._parameters
+        self._parameters = None
         try:
             rays = rays_of(convert.estimated_camera(camera, told)[0], self._line, factor=self._factor)
         except ValueError as error:

@@ -90,6 +90,14 @@ class GrowingOrthoimage:
         if self._rectifier is not None:
             self._rectifier.rays = rays
 
+    def look_with(self, rays: Rays) -> None:
+        """Lines of another CCD line come from now on: what the one before has shown goes, poses and cells stay."""
+        if self._rays is not None:
+            self._rays = rays
+        self.mosaic, self._rectifier, self.strip = None, None, ""
+        self._waiting.clear()
+        self._waiting_bytes = 0
+
     def add_pose(self, time_s: float, position_l: Array, quaternion: Array, covariance: Array, smoothed: bool) -> bool:
         """A measured pose; False for one that comes too late."""
         late = self._measured.add([time_s], position_l[None], quaternion[None], covariance[None], smoothed)
