@@ -108,7 +108,11 @@ def test_tables_and_keys_that_nobody_reads_are_refused(tmp_path, capsys):
     ("text", "what"),
     [
         ("not json {", "line 1, column 1: expected array"),
-        ('{\nmode:"foo"}', "line 2: unknown variant `foo`"),
+        ('{\nmode:"foo"}', "line 2: unknown value 'foo', wanted router, peer or client"),
+        ('{\nmode:"peer",\nscoutin: 1}', "line 3: unknown key 'scoutin', wanted scouting"),
+        ("{\nscouting:{\nmulticast: {enabld: true}}}", "line 3: unknown key 'enabld', wanted enabled"),
+        ("{\nconnect: {qqq: 1}}", "line 2: unknown key 'qqq', wanted timeout_ms, endpoints, exit_on_failure or retry"),
+        ("{qqq: 1}", "line 1: unknown key 'qqq', wanted one of "),
         ("", "Empty config file"),
     ],
 )
@@ -117,7 +121,14 @@ def test_a_bad_bus_file_is_told_without_what_zenoh_is_made_of(tmp_path, text, wh
         configuration(file=write(tmp_path / "bus.json5", text))
     said = str(caught.value)
     assert f"bus.json5: not a Zenoh configuration: {what}" in said
-    assert "\n" not in said and ".rs" not in said and "cargo" not in said
+    assert "\n" not in said and ".rs" not in said and "cargo" not in said and "`" not in said
+    assert len(said) < len(str(tmp_path)) + 170  # it was a list of all keys
+
+
+def test_a_key_of_a_bus_file_in_yaml_is_told_alike(tmp_path):
+    wanted = r"bus\.yaml: not a Zenoh configuration: line 2: unknown key 'lisen', wanted listen$"
+    with pytest.raises(UserError, match=wanted):
+        configuration(file=write(tmp_path / "bus.yaml", "mode: peer\nlisen: {}\n"))
 
 
 def test_every_step_node_can_be_loaded_and_keeps_to_the_topic_table():
