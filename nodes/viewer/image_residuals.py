@@ -9,7 +9,7 @@ import numpy as np
 
 from ..node import Message
 from .canvas import Canvas
-from .scene_part import CCD_COLORS, REJECTED, Part, faded
+from .scene_part import REJECTED, Part, ccd_color, faded
 from .scene_state import SceneState, round_number
 
 _NEWEST = 1500  # rays a view shows
@@ -97,7 +97,7 @@ class ImagePart(Part):
             length = np.linalg.norm(vector, axis=1)
             longest = 2 * bar  # a rejected ray may be far off; its arrow shows where to
             vector[bad] *= np.minimum(1.0, longest / np.maximum(length[bad], 1e-9))[:, None]
-            color = CCD_COLORS[self.state.ccds.index(ccd) % len(CCD_COLORS)]
+            color = ccd_color(self.state.ccds.index(ccd))
             shades = [faded(color, _SETTLED) if settled else color for settled in rows[:, 5] > 0]
             for name, chosen in (("residuals", ~bad), ("rejected", bad)):
                 own = [REJECTED if bad[i] else shades[i] for i in np.flatnonzero(chosen)]

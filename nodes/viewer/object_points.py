@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from .. import convert
 from ..node import Message
 from .canvas import Canvas, Color
-from .scene_part import CCD_COLORS, CHECK, CONTROL, FINAL, LIVE, REJECTED, Part, Pieces, faded
+from .scene_part import CHECK, CONTROL, FINAL, LIVE, REJECTED, Part, Pieces, ccd_color, faded
 from .scene_state import SceneState, forward
 
 Array = NDArray[np.floating]
@@ -85,7 +85,7 @@ class PointsPart(Part):
                 continue
             advance = self.state.speed_m_s / strip.line_rate_hz
             vector = r.v_line * advance * along + r.v_sample * self.state.gsd_m * left
-            color = CCD_COLORS[ccds.index(r.ccd) % len(CCD_COLORS)]
+            color = ccd_color(ccds.index(r.ccd))
             rows.append((xyz, self.state.residual_scale * vector, color))
         return rows
 

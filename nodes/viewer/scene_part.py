@@ -30,10 +30,20 @@ LEGEND = (
     ("check", CHECK),
     ("rejected ray", REJECTED),
 )
-CCD_COLORS = ((255, 140, 120, 255), (235, 225, 140, 255), (130, 170, 255, 255), (190, 140, 255, 255))
+# Nine, as MISR has. From the fifth on the colour-blind tell each from all others, too (CIELAB distance of 25 and more
+# for normal, protan and deutan eyes), and from LIVE, REJECTED and the ground of the views (20).
+CCD_COLORS = (
+    (255, 140, 120, 255), (235, 225, 140, 255), (130, 170, 255, 255), (190, 140, 255, 255), (190, 250, 250, 255),
+    (250, 250, 40, 255), (190, 70, 130, 255), (175, 40, 250, 255), (55, 130, 40, 255),
+)  # fmt: skip
 
 
 _GROUND = (18, 20, 26)
+
+
+def ccd_color(number: int) -> Color:
+    """The colour of a CCD line, by its number in the camera."""
+    return CCD_COLORS[number % len(CCD_COLORS)]
 
 
 def faded(color: Color, share: float) -> Color:

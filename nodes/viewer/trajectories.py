@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ...solver.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
 from ..convert import SECOND_NS, PoseSample
 from .canvas import Canvas
-from .scene_part import CCD_COLORS, FILTERED, FINAL, LIVE, TRUTH, Part, Pieces
+from .scene_part import FILTERED, FINAL, LIVE, TRUTH, Part, Pieces, ccd_color
 from .scene_state import SceneState
 
 Array = NDArray[np.floating]
@@ -121,7 +121,7 @@ class FlightPart(Part):
             ground = pose.position_l + reach[:, None] * rays
             fan = np.array([pose.position_l, ground[0], ground[1], pose.position_l])
             fans.append(self.state.display(fan))
-            colors.append(CCD_COLORS[k % len(CCD_COLORS)])
+            colors.append(ccd_color(k))
             names.append(line.id)
         canvas.lines("flight/looks", fans, colors, 0.8, names)
 
