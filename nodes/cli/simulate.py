@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ...solver.simulation.ground_points import shortest_coverage_s
 from ...solver.simulation.orbital_scene import ORBITAL_SENSORS
+from ...solver.simulation.scenario import Simulation
 from .. import convert
 from ..batch.rectification import true_relief
 from ..batch.simulated_scenes import SceneSimulation, simulated_recording, write_simulated_scenes
@@ -216,6 +219,7 @@ def _summary(flight: SimulatedFlight, seconds: float, output: str, seed: int, co
             for strip, (t0, t1) in zip(strips, times, strict=True)
         },
         "points": {role: roles[role] for role in ("tie", "control", "check")},
+        "notes": _left_out(simulation, roles),
         "rays": len(images),
         "rays_per_s": len(images) / float(np.sum(times[:, 1] - times[:, 0])),
         "outliers": int(images.outlier.sum()),
@@ -226,6 +230,36 @@ def _summary(flight: SimulatedFlight, seconds: float, output: str, seed: int, co
     if motion is not None:
         result["motion"] = {"poses": len(motion.trajectory), "steps_taken_out": motion.jumps}
     return result
+
+
+def _left_out(simulation: Simulation, roles: Mapping[str, int]) -> list[str]:
+    """A line where points that were asked for are not in the flight, since they are not seen often enough."""
+    flight, plan = simulation.flight, simulation.observation_plan
+    missing = [
+        f"{wanted - roles[role]} of {wanted} {name}"
+        for role, name, wanted in (("control", "control points", plan.control), ("check", "check points", plan.check))
+        if roles[role] < wanted
+    ]
+    if plan.tie_points_per_s > 0 and not roles["tie"]:
+        missing.append("all tie points")
+    if not missing:
+        return []
+    if len(flight.camera.lines) == 1:
+        why = "the camera has one CCD line, and sees a point once in a strip: wanted strips that overlap"
+    else:
+        needed = [shortest_coverage_s(flight, strip) for strip in flight.strips]
+        lasting = [float(t1 - t0) for t0, t1 in flight.strip_times_s]
+        short = [k for k in range(len(needed)) if lasting[k] < needed[k]]
+        if not short:
+            why = ""
+        else:
+            k = max(short, key=needed.__getitem__)
+            why = (
+                f"all CCD lines see the same ground where a strip lasts {needed[k]:.0f} s or longer, "
+                f"and {flight.strips[k].id} lasts {lasting[k]:.0f} s"
+            )
+    told = f"left out {' and '.join(missing)}, which are not seen often enough (twice; control once)"
+    return [f"{told}: {why}" if why else told]
 
 
 def _print_summary(result: dict[str, Any]) -> None:
@@ -242,4 +276,6 @@ def _print_summary(result: dict[str, Any]) -> None:
         f"  {points['tie']} tie points, {points['control']} control, {points['check']} check; {result['rays']} rays "
         f"({result['rays_per_s']:.0f} a second of strip), {result['outliers']} of them blunders"
     )
+    for note in result["notes"]:
+        print(f"  note: {note}")
     print("  messages: " + ", ".join(f"{topic} {count}" for topic, count in result["messages"].items()))

@@ -110,15 +110,28 @@ def _scattered(count: int, rng: np.random.Generator) -> tuple[Array, Array]:
 def full_coverage(flight: Flight, strip: Strip) -> tuple[float, float]:
     """When the steepest line sees ground that all lines of the strip see; else the whole strip."""
     start, end = strip.first_line_time_s, float(strip.time_of(strip.lines - 1))
+    ahead, behind = _apart_s(flight, strip)
+    first, last = start + ahead + COVERAGE_MARGIN_S, end + behind - COVERAGE_MARGIN_S
+    return (float(first), float(last)) if first < last else (start, end)
+
+
+def shortest_coverage_s(flight: Flight, strip: Strip) -> float:
+    """How long a strip has to last so that all its lines see some ground together, s."""
+    ahead, behind = _apart_s(flight, strip)
+    return ahead - behind + 2 * COVERAGE_MARGIN_S
+
+
+def _apart_s(flight: Flight, strip: Strip) -> tuple[float, float]:
+    """After how long the steepest line sees what the foremost one has seen, and the hindmost one, s (the latter
+    negative: it sees it later)."""
+    start, end = strip.first_line_time_s, float(strip.time_of(strip.lines - 1))
     middle = flight.truth.at(0.5 * (start + end))
     position = middle.position_l[0]
     height = float(position[2] - flight.terrain.height(position[0], position[1]))
     speed = float(np.hypot(*middle.velocity_l[0, :2]))
     tangents = view_tangents(flight.camera)
     tangents = tangents - tangents[np.argmin(np.abs(tangents))]
-    first = start + tangents.max() * height / speed + COVERAGE_MARGIN_S
-    last = end + tangents.min() * height / speed - COVERAGE_MARGIN_S
-    return (float(first), float(last)) if first < last else (start, end)
+    return float(tangents.max() * height / speed), float(tangents.min() * height / speed)
 
 
 def _seen(flight: Flight, time_s: Array, across: Array) -> Array:

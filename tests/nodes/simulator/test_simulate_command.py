@@ -486,3 +486,33 @@ def test_motion_of_what_has_no_poses_is_refused_in_one_line(tmp_path, capsys):
     poses = lively_track(tmp_path / "poses.csv")
     assert main(["simulate", "-o", str(tmp_path / "x.mcap"), "--motion", str(poses), "--ground", "900"]) == 1
     assert "below the ground at 900 m" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--seconds", "4"], "left out 6 of 6 check points and all tie points, "),
+        (["--seconds", "8"], "left out 5 of 6 check points, "),
+        (["--seconds", "25"], ""),
+    ],
+)
+def test_why_points_that_were_asked_for_are_not_there_is_said(words, told, tmp_path, capsys):
+    """A strip too short for all views to see the same ground had 0 check points, without a word."""
+    command = ["simulate", "-o", str(tmp_path / "a.mcap"), "--sensor", "ads40-small", "--control", "4", "--check", "6"]
+    assert main([*command, *words, "--seed", "1"]) == 0
+    said = capsys.readouterr().out
+    assert ("note: " in said) is bool(told)
+    if told:
+        assert f"  note: {told}which are not seen often enough (twice; control once): all CCD lines " in said
+        assert f" see the same ground where a strip lasts 20 s or longer, and S1 lasts {words[1]} s\n" in said
+    assert main([*command, *words, "--seed", "1", "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["notes"]) == bool(told)
+
+
+def test_a_camera_with_one_ccd_line_is_named_as_the_reason(tmp_path, capsys):
+    line = {"id": "N", "lens": "L", "pixels": 500, "pixel_size_mm": 0.01, "center_mm": [0, 0], "inclination_deg": 0}
+    camera = {"name": "one", "lenses": [{"id": "L", "focal_length_mm": 60.0}], "lines": [line]}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    words = ["simulate", "-o", str(tmp_path / "a.mcap"), "--sensor", str(tmp_path / "camera.json"), "--seconds", "10"]
+    assert main([*words, "--control", "2", "--check", "3"]) == 0
+    assert "the camera has one CCD line, and sees a point once in a strip: wanted strips" in capsys.readouterr().out
