@@ -8,7 +8,7 @@ from __future__ import annotations
 import selectors
 import socket
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any
@@ -98,7 +98,7 @@ class StreamParser:
     def __init__(self, clock: Clock, problem: Any) -> None:
         self._clock, self._problem = clock, problem
         self._data = bytearray()
-        self._block: tuple[LineBlock, int, int] | None = None  # without pixels yet; samples, bytes
+        self._block: tuple[LineBlock, int, int] | None = None  # one without pixels yet; samples, bytes
         self._kind = _PIXELS[8]
 
     def feed(self, data: bytes) -> list[Message]:
@@ -113,8 +113,7 @@ class StreamParser:
                 pixels = pixels_of(bytes(self._data[:size]), samples, self._kind)
                 del self._data[:size]
                 self._block = None
-                whole = LineBlock(pixels, block.ccd, block.strip, block.first_line, block.time_ns, block.line_period_ns)
-                out.append(block_message(self._clock, whole))
+                out.append(block_message(self._clock, replace(block, pixels=pixels)))
                 continue
             end = self._data.find(b"\n")
             if end < 0:
@@ -168,11 +167,12 @@ class StreamParser:
         return [Message("sensor/imu", stamp, body)]
 
     def _begin_lines(self, words: list[bytes]) -> None:
-        first, time_ns, period_ns, lines, samples, bits = (int(word) for word in words[2:])
+        first, time_ns, lines, samples, bits = (int(words[k]) for k in (2, 3, 5, 6, 7))
+        period_ns = float(words[4])
         if bits not in _PIXELS:
             raise ValueError(f"{bits} bits, wanted 8 or 16")
         size = lines * samples * bits // 8
-        if min(first, time_ns) < 0 or min(period_ns, lines, samples) < 1 or size > LARGEST:
+        if min(first, time_ns) < 0 or not period_ns >= 1 or min(lines, samples) < 1 or size > LARGEST:
             raise ValueError("wanted at least one line and sample, a period above 0, and 64 MB at most")
         utc_ns = self._clock.utc(time_ns)
         if utc_ns < 0 or utc_ns + lines * period_ns > LATEST_NS or first + lines > MOST_LINES:
@@ -180,7 +180,10 @@ class StreamParser:
         self._kind = _PIXELS[bits]
         empty = np.empty((0, samples), self._kind)
         ccd, strip = words[0].decode("ascii", "replace"), words[1].decode("ascii", "replace")
-        block = LineBlock(empty, ccd, strip, first, utc_ns, period_ns)
+        block = LineBlock(empty, ccd, strip, first, utc_ns, round(period_ns))
+        if lines > 1 and period_ns % 1:  # a message has whole ns between lines, and these would drift
+            times = utc_ns + np.rint(period_ns * np.arange(lines)).astype(np.int64)
+            block = replace(block, line_period_ns=0, line_times_ns=times)
         self._block = block, samples, size
 
 

@@ -17,6 +17,7 @@ from places import ROOT
 from triline.nodes.convert import time_ns
 from triline.nodes.errors import UserError
 from triline.nodes.formats.keys import Keys
+from triline.nodes.matcher.found_strips import FoundStrips
 from triline.nodes.sensors.program import Clock
 from triline.nodes.sensors.stream import Stream, StreamParser, StreamSettings
 
@@ -184,3 +185,34 @@ def test_the_program_in_c_names_a_row_that_it_cannot_read(program, bad):
 def test_the_program_in_c_says_when_nobody_listens(program):
     done = subprocess.run([program, "127.0.0.1", str(free_port())], input="", capture_output=True, text=True)
     assert done.returncode == 1 and "nobody listens" in done.stderr
+
+
+def lines_at(rate_hz: float, period: str, first: int, lines: int = 100):
+    """The block from a line on that a driver sends which counts by the rate; it states this period."""
+    t = T + round(first * 1e9 / rate_hz)
+    (message,), counts = parse(f"LINES N S1 {first} {t} {period} {lines} 2 8\n".encode() + bytes(2 * lines))
+    assert not counts
+    return message
+
+
+def test_a_period_that_is_no_whole_number_of_ns_keeps_the_times_of_the_source():
+    """753 lines/s: 0.25 ns a line were lost, after 20 minutes 0.2 ms, or 1.6 cm in flight."""
+    rate_hz, lines = 753.0, np.arange(900_000, 900_100)
+    exact = T + np.rint(lines * 1e9 / rate_hz).astype(np.int64)
+    for period, off_ns in (("1328021.248339973", 2), ("1328021", 30)):
+        message = lines_at(rate_hz, period, 900_000)
+        assert abs(message.body.times_ns() - exact).max() <= off_ns and message.stamp_ns == message.body.times_ns()[-1]
+        strip = FoundStrips().begin(lines_at(rate_hz, period, 0).body)
+        drift_s = abs(900_000 / strip.line_rate_hz - 900_000 / rate_hz)
+        assert drift_s < 2e-5 if "." in period else drift_s == pytest.approx(2.2e-4, rel=0.05)
+    # tie points have the times of the lines themselves, as far as they are told
+    assert lines_at(rate_hz, "1328021.248339973", 0).body.line_times_ns is not None
+    whole = lines_at(rate_hz, "1328021.0", 0).body
+    assert whole.line_times_ns is None and whole.line_period_ns == 1_328_021
+    assert lines_at(rate_hz, "1328021.25", 0, lines=1).body.line_period_ns == 1_328_021
+
+
+@pytest.mark.parametrize("period", ["0.5", "nan", "inf", "-3.5", "1e30", "x"])
+def test_a_period_that_no_camera_has_is_refused(period):
+    _, counts = parse(f"LINES N S1 0 {T} {period} 3 4 16\n".encode() + PIXELS.tobytes())
+    assert counts["not readable"] == 1
