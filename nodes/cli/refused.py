@@ -14,7 +14,9 @@ def refused_inputs(statuses: Mapping[str, Any], nodes: Iterable[str]) -> list[st
     told = []
     for name in nodes:
         status = statuses.get(name)
-        for topics in PURPOSES if status is not None else ():
+        if status is None:
+            continue
+        for topics in PURPOSES:
             rows = [row for row in status.topics if row.topic.startswith(topics)]
             received, refused = (sum(getattr(row, what) for row in rows) for what in ("received", "refused"))
             if received and refused + sum(row.duplicates for row in rows) >= received and refused:

@@ -400,7 +400,7 @@ def _corrections(flight: Flight, name: str, rays: ImageRays) -> tuple[Array, Arr
         return _correction_at(flight, poses, rays.time_s)
     correction, covariance = np.full((len(rays.time_s), 6), np.nan), np.full((len(rays.time_s), 6, 6), np.nan)
     for number, strip in enumerate(flight.strips):
-        inside, own = rays.strip == number, poses.of(strip)
+        inside, own = np.asarray(rays.strip) == number, poses.of(strip)
         if inside.any() and len(own) >= 2:
             correction[inside], covariance[inside] = _correction_at(flight, own, rays.time_s[inside])
     return correction, covariance

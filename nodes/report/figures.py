@@ -94,14 +94,16 @@ def _strips(ax: Axes, flight: Flight, poses: PoseSeries, place: Any) -> None:
         ax.plot(x, y, color="#34495e", lw=2.4, solid_capstyle="butt", label="strip" if k == 0 else None)
         ax.annotate("", (x[-1], y[-1]), (x[-2], y[-2]), arrowprops={"arrowstyle": "-|>", "color": "#34495e", "lw": 2})
         begin = np.array([x[0], y[0]])
-        there = next((ids for at, ids in named if np.hypot(*(at - begin)) <= near), None)
-        if there is None:
-            named.append((begin, there := []))
-        there.append(shortened(id, _NAME))
+        there = [ids for at, ids in named if np.hypot(*(at - begin)) <= near]
+        if not there:
+            named.append((begin, ids := []))
+            there = [ids]
+        there[0].append(shortened(id, _NAME))
     text = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center", "color": "#34495e", "weight": "bold"}
     above = {"zorder": 7, "bbox": {"color": "white", "alpha": 0.6, "pad": 0.5, "lw": 0}}  # legible among points
     for at, ids in named:
-        ax.annotate(", ".join(ids[:_MOST_NAMES]) + (", …" if len(ids) > _MOST_NAMES else ""), at, **text, **above)
+        more = ", …" if len(ids) > _MOST_NAMES else ""
+        ax.annotate(", ".join(ids[:_MOST_NAMES]) + more, (float(at[0]), float(at[1])), **text, **above)
 
 
 def _misfits(ax: Axes, flight: Flight, place: Any, length_km: float, turned: bool) -> None:

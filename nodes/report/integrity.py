@@ -121,11 +121,12 @@ def levels(flight: Flight) -> tuple[Array, Array, Array, Array] | None:
     protection, sigma = (np.array([row[k] for row in rows], dtype=float) for k in (1, 2))
     error = np.full((len(rows), 6), np.nan)
     live = orientation_errors(flight).get("live")
-    strips = np.array([row[3] for row in rows])
-    for strip in np.unique(strips) if live is not None else ():
-        own, of_strip = strips == strip, (live.strip == strip) | (live.strip == "")
-        if of_strip.any():
-            error[own] = _errors_at(stamps[own], live.time_ns[of_strip], live.error[of_strip])
+    if live is not None:
+        strips = np.array([row[3] for row in rows])
+        for strip in np.unique(strips):
+            own, of_strip = strips == strip, (live.strip == strip) | (live.strip == "")
+            if of_strip.any():
+                error[own] = _errors_at(stamps[own], live.time_ns[of_strip], live.error[of_strip])
     return flight.seconds(stamps), protection, sigma, error
 
 
