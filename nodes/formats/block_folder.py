@@ -227,7 +227,8 @@ def _to_local(table: Table, xyz: NDArray[np.float64], frame: Frame) -> NDArray[n
                 frame.from_crs(xyz[row : row + 1])
             except CrsError:
                 where = f"{table.path}:{table.line_of(row)}: {table.headed.get('X_m', 'X_m')}"
-                raise UserError(f"{where}: {xyz[row].tolist()} lies outside the area of {frame.crs!r}") from None
+                hint = " (longitude first, then latitude)" if frame.units[0] == "deg" else ""
+                raise UserError(f"{where}: {xyz[row].tolist()} lies outside the area of {frame.crs!r}{hint}") from None
         raise UserError(f"{table.path}: {error}") from None
 
 

@@ -61,6 +61,13 @@ DEFAULTS: Mapping[str, object] = {
 MODELS = ("rigorous", "rpc", "affine", "dlt")
 #: Image points so far outside their scene cannot be used, pixels.
 _OUTSIDE_PX = 0.5
+#: A known point so many metres from where its pixels lie by the metadata has the coordinates of another place, and all
+#: known points together if the median lies so far. Tuned: data snooping finds single points that are some degrees
+#: off, but polynomials say anything of another continent; half a degree of attitude from 830 km up is less than the
+#: second.
+_OTHER_PLACE_M, _OTHER_SCENE_M = 1_000_000.0, 10_000.0
+#: Both are at least so many sigmas of place and attitude, these from so many metres up.
+_OTHER_SIGMAS, _UP_M = 5.0, 8e5
 #: Rows that cannot be used and are named one by one.
 _MOST_NAMED = 5
 
@@ -273,7 +280,9 @@ def read_scene_block(folder: Path, with_lines: bool = False) -> SceneBlockData:
         notes.extend(f"image {image}: no image points; it takes no part" for image in unused)
         images = tuple(images[k] for k in used)
         rays = replace(rays, image=np.searchsorted(used, rays.image))
-    return SceneBlockData(name, frame, images, ids, rays, ground, settings, then, rpc, ellipsoid, sigma, tuple(notes))
+    data = SceneBlockData(name, frame, images, ids, rays, ground, settings, then, rpc, ellipsoid, sigma, tuple(notes))
+    _refuse_other_places(folder / "ground_points.csv", data)
+    return data
 
 
 def _rpc_settings(table: Keys) -> dict[str, object]:
@@ -440,6 +449,47 @@ def _image_points(
         stated = table["sigma_px"][rows]
         sigma = np.where(np.isnan(stated), sigma, stated)
     return tuple(ids), ImagePoints(image_of[rows], point, line[rows], sample[rows], sigma)
+
+
+def _refuse_other_places(path: Path, data: SceneBlockData) -> None:
+    """Refuse known points that lie elsewhere than the metadata see them: their pixels, at their heights.
+
+    Raises
+    ------
+    UserError : naming the point that is farthest off, or how far all of them are
+    """
+    ground, ellipsoid = data.ground, data.ellipsoid
+    position = ground.xyz_l @ data.frame.R_el.T + data.frame.origin_e
+    height = ellipsoid.geodetic(position)[:, 2] if len(ground) else np.empty(0)
+    placed = np.array([role != "height" for role in ground.role], dtype=bool)
+    away = np.full(len(ground), np.inf)
+    for k, image in enumerate(data.images):
+        mine = np.flatnonzero((data.rays.image == k) & (data.rays.point < len(ground)))
+        mine = mine[placed[data.rays.point[mine]]]
+        if image.scene.model not in ("rigorous", "rpc") or not len(mine):  # the others know nothing beforehand
+            continue
+        point = data.rays.point[mine]
+        with np.errstate(all="ignore"):  # a ray that misses the ground says nothing
+            lat, lon, _ = image.location.direct(data.rays.line[mine], data.rays.sample[mine], height[point]).T
+            off = np.linalg.norm(ellipsoid.cartesian(lat, lon, height[point]) - position[point], axis=1)
+        np.fmin.at(away, point, off)
+    seen = np.flatnonzero(np.isfinite(away))
+    if not len(seen):
+        return
+    settings = data.trajectory_settings()
+    place, turn = (np.max(np.asarray(settings[key], dtype=float)) for key in ("offset_sigma_m", "shift_sigma_deg"))
+    most = _OTHER_SIGMAS * float(place + np.radians(turn) * _UP_M)
+    worst, usual = seen[int(np.argmax(away[seen]))], float(np.median(away[seen]))
+    by = "from where their pixels lie by the metadata"
+    wanted = "longitude first (X), then latitude (Y)" if data.frame.units[0] == "deg" else f"places in {data.frame.crs}"
+    if usual > max(most, _OTHER_SCENE_M):
+        raise UserError(
+            f"{path}: {len(seen)} known points lie {1e-3 * usual:.0f} km (median) {by}, wanted {wanted}, and the "
+            "metadata of these scenes"
+        )
+    if away[worst] > max(most, _OTHER_PLACE_M):
+        by = by.replace("their", "its")
+        raise UserError(f"{path}: point {ground.id[worst]} lies {1e-3 * away[worst]:.0f} km {by}, wanted {wanted}")
 
 
 def _repeats(*columns: NDArray[np.generic]) -> NDArray[np.bool_]:

@@ -285,11 +285,67 @@ def test_control_that_lost_its_image_points_is_named(block, capsys):
     assert any(f"lost all its image points and stands as given: {wrong};" in note for note in result["notes"])
 
 
+def swapped(path, which):
+    """Longitude and latitude exchanged in rows of ground_points.csv."""
+    known = pd.read_csv(path)
+    known.loc[which, ["X_m", "Y_m"]] = known.loc[which, ["Y_m", "X_m"]].to_numpy()
+    known.to_csv(path, index=False)
+
+
+@pytest.mark.parametrize("command", ["adjust", "import", "study"])
+def test_longitudes_and_latitudes_that_are_swapped_are_refused(command, tmp_path, capsys):
+    """All of them, with --snoop: sigma0 1, passed and converged, no control left, check points 4 700 km off."""
+    block, out = tmp_path / "pair", str(tmp_path / "out.mcap")
+    place = ["--satellite", "spot5-hrs-small", "--place", "44", "5", "--points", "40", "--control", "9"]
+    assert main(["simulate", "-q", "-o", str(block), *place]) == 0
+    swapped(block / "ground_points.csv", slice(None))
+    more = {"adjust": [str(block), "--snoop"], "import": [str(block), "-o", out], "study": ["control", str(block)]}
+    assert main([command, *more[command]]) == 1
+    error = capsys.readouterr().err
+    assert re.search(r"ground_points.csv: \d\d known points lie 5[56]\d\d km \(median\) from where their pixels", error)
+    assert "wanted longitude first (X), then latitude (Y), and the metadata of these" in error
+
+
+def test_metadata_of_another_scene_are_refused_unless_they_are_said_to_be_that_bad(tmp_path, capsys):
+    for name, lat in (("pair", "44"), ("other", "44.4")):
+        place = ["--satellite", "spot5-hrs-small", "--place", lat, "5", "--points", "40", "--control", "9"]
+        assert main(["simulate", "-q", "-o", str(tmp_path / name), *place]) == 0
+    metadata = tmp_path / "pair" / "spot5-hrs-small"
+    shutil.rmtree(metadata)
+    shutil.copytree(tmp_path / "other" / "spot5-hrs-small", metadata)
+    assert main(["adjust", str(tmp_path / "pair"), "--snoop"]) == 1
+    assert re.search(r"34 known points lie 4\d km \(median\) from where", capsys.readouterr().err)
+    with open(tmp_path / "pair" / "project.toml", "a") as file:
+        file.write("[trajectory]\noffset_sigma_m = [20000, 20000, 20000]\n")
+    assert main(["adjust", str(tmp_path / "pair"), "--snoop", "-q"]) == 0
+
+
+def test_one_swapped_control_point_of_polynomials_is_refused(made, tmp_path, capsys):
+    """One of nine: nothing was left of the block but one point, "sigma0 1.0000, passed, NOT CONVERGED"."""
+    block = tmp_path / "rpc"
+    block.mkdir()
+    entries = []
+    for ccd in "FB":
+        write_rpb(block / f"{ccd}.RPB", fit_to_model(read_scene(made / "spot5-hrs").sensors[ccd], -500.0, 2500.0).rpc)
+        entries.append(f'[scenes.{ccd}]\nmetadata = "{ccd}.RPB"\n')
+    (block / "project.toml").write_text('[project]\ncrs = "EPSG:4979"\n' + "".join(entries))
+    shutil.copy(made / "ground_points.csv", block)
+    image = pd.read_csv(made / "image_points.csv")
+    image.assign(strip=image["ccd"], ccd="").to_csv(block / "image_points.csv", index=False)
+    assert main(["adjust", str(block), "-q"]) == 0
+    known = pd.read_csv(block / "ground_points.csv")
+    known.loc[2, ["X_m", "Y_m"]] = [36.14, 39.6]  # as 139.6, 36.14 may be mistyped
+    known.to_csv(block / "ground_points.csv", index=False)
+    capsys.readouterr()
+    assert main(["adjust", str(block), "--snoop"]) == 1
+    assert re.search(r"ground_points.csv: point P2 lies 79\d{2} km from where its pixels lie", capsys.readouterr().err)
+
+
 @pytest.mark.parametrize(
     ("off_deg", "all_of_it", "told"),
     [
         (1.0, False, r"control point {} lies 11\d{{4}} m from where its rays meet"),
-        (-90.0, True, r"control lies \d{{7}} m from where its rays meet \(median\): check its coordinate reference"),
+        (-5.0, True, r"control lies 5\d{{5}} m from where its rays meet \(median\): check its coordinate reference"),
     ],
 )
 def test_a_block_that_does_not_converge_names_control_that_lies_elsewhere(
