@@ -12,7 +12,8 @@ Content = Mapping[str, Any]
 #: Rejected image points that are listed; the others are in ``result.json``.
 MOST_REJECTED = 10
 
-
+#: Kinds of images of a block of scenes, for people.
+_KINDS = {"rigorous": "rigorous", "rpc": "RPC", "affine": "affine model", "dlt": "DLT"}
 #: What the differences to given coordinates hold beside the errors of the points.
 _WITH_SURVEY = {
     "check": "from sigma and the survey's own",
@@ -40,6 +41,9 @@ def summary_lines(content: Content, *, verbose: bool = False) -> Iterator[str]:
 def _head(c: Content) -> Iterator[str]:
     model = c["model"].upper() + (f", then {c['then'].upper()}" if c["then"] else "")
     calibration = "no self-calibration" if c["selfcal"] == "none" else f"self-calibration {c['selfcal']}"
+    kinds = c.get("images", {}).values()
+    if kinds and "rigorous" not in kinds:  # neither a trajectory nor a camera to model
+        model, calibration = ", ".join(sorted({_KINDS[kind] for kind in kinds})), "corrections in the images"
     yield f"{c['project']}: {model}, {calibration}"
     yield (
         f"{c['n_image_points']} image points, {c['n_points']} object points, {len(c['strips'])} correction sets; "
@@ -105,9 +109,12 @@ def _strips(content: Content) -> Iterator[str]:
             if kind:
                 yield f"strip {id}: {len(strip[kind])} {kind}"
         if "coefficients" in strip:
-            yield f"image {id}, {strip['model']}"
+            in_pixels = strip["model"] == "rpc"
+            unit = "; px, along lines and samples from the middle of the image to its edge" if in_pixels else ""
+            yield f"image {id}, {_KINDS[strip['model']]}{unit}"
             for name, c in strip["coefficients"].items():
-                yield f"  {name:24s}{c['value']:16.8g} +- {_number(c['sigma'], '.3g')}"
+                value = f"{c['value']:16.4f}" if in_pixels else f"{c['value']:16.8g}"
+                yield f"  {name:24s}{value} +- {_number(c['sigma'], '.4f' if in_pixels else '.3g')}"
 
 
 def _platform(c: Content) -> Iterator[str]:
@@ -152,7 +159,8 @@ def _rejected(c: Content, verbose: bool) -> Iterator[str]:
     shown = rejected if verbose else rejected[:MOST_REJECTED]
     for r in shown:
         w = f"w {r['w']:.1f}" if r["w"] else "no w"
-        yield f"  point {r['point']}, strip {r['strip']}, {r['ccd']}: {w} ({r['reason']})"
+        ccd = f", {r['ccd']}" if r["ccd"] else ""
+        yield f"  point {r['point']}, strip {r['strip']}{ccd}: {w} ({r['reason']})"
     if len(shown) < len(rejected):
         yield f"  and {len(rejected) - len(shown)} more"
 

@@ -353,8 +353,9 @@ def _unknowns(problem: Problem, solution: SceneSolution) -> tuple[dict[str, Any]
             strips[group.key] = {"model": "rigorous"} | models[group.key].describe(value, spread)
         elif group.kind == IMAGE:
             kind = next(i.kind for i in problem.block.images if i.name == group.key)
+            unit = {"unit": "px"} if kind == "rpc" else {}
             coefficients = {
-                name.removesuffix(f" of {group.key}"): {"value": v, "sigma": e}
+                name.removesuffix(f" of {group.key}"): {"value": v, "sigma": e} | unit
                 for name, v, e in zip(group.names, value, spread, strict=True)
             }
             strips[group.key] = {"model": kind, "coefficients": coefficients}

@@ -332,7 +332,12 @@ def test_one_swapped_control_point_of_polynomials_is_refused(made, tmp_path, cap
     shutil.copy(made / "ground_points.csv", block)
     image = pd.read_csv(made / "image_points.csv")
     image.assign(strip=image["ccd"], ccd="").to_csv(block / "image_points.csv", index=False)
-    assert main(["adjust", str(block), "-q"]) == 0
+    assert main(["adjust", str(block), "--snoop", "-q"]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == "rpc: RPC, corrections in the images"  # "DGR, no self-calibration"
+    assert "image F, RPC; px, along lines and samples from the middle of the image to its edge" in printed
+    assert re.fullmatch(r"  line shift +-?\d+\.\d{4} \+- \d+\.\d{4}", next(x for x in printed if "line shift" in x))
+    assert any(re.fullmatch(r"  point P\d+, strip [FB]: w .*", line) for line in printed)  # "strip F, : w"
     known = pd.read_csv(block / "ground_points.csv")
     known.loc[2, ["X_m", "Y_m"]] = [36.14, 39.6]  # as 139.6, 36.14 may be mistyped
     known.to_csv(block / "ground_points.csv", index=False)
