@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...solver.adjustment.reliability import CRITICAL_W
 from ...solver.adjustment.variance_components import LEAST_REDUNDANCY
 from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
 from ...solver.location.affine_bias import BiasFit, CorrectedModel, fit_bias
@@ -19,7 +20,7 @@ from ...solver.location.frame_camera import FrameCamera
 from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.location.rpc import Rpc
 from ...solver.location.uncertainty import Sigmas, pixel_covariance
-from ...solver.rectification.frame_parameters import TWELVE, FrameControl, FrameFit, fit_frame, stated_priors
+from ...solver.rectification.frame_parameters import THIRTEEN, UNITS, FrameControl, FrameFit, fit_frame, stated_priors
 from ...solver.rectification.grid import MapGrid, default_crs
 from ...solver.rectification.pixel_to_cell import meet_terrain
 from ...solver.rectification.sampled import SomeCells, ground_steps, metres_a_radian
@@ -268,6 +269,11 @@ def _sensor(args: argparse.Namespace, image: SourceImage) -> _Sensor:
                 f"{args.control}: {int(out.sum())} of {len(out)} points are left out: they contradict the others, or "
                 f"what {path.name} says of place and attitude (its sigma; without one as good as of a star tracker)"
             )
+        notes.extend(
+            f"control: {word} {value:+.4g} {unit}: {abs(w):.1f} times what {path.name}, or usual cameras, let expect"
+            for (word, value, _, unit), w in zip(_for_people(found), found.w, strict=True)
+            if abs(w) > CRITICAL_W
+        )
         return _Sensor(found.camera, found.camera, kind, (line, sample), sigmas, None, ellipsoid, notes, found)
     if args.control is not None:
         fit = _correction(args, Path(args.control), model, image)
@@ -336,7 +342,7 @@ def _control(path: Path, image: SourceImage) -> Any:
 def _camera_by_control(
     args: argparse.Namespace, path: Path, model: Any, image: SourceImage, sigmas: Sigmas
 ) -> FrameFit:
-    """The frame camera with the parameters of `TWELVE`, by control with errors in pixel and height.
+    """The frame camera with the parameters of `THIRTEEN`, by control with errors in pixel and height.
 
     ``sigmas`` : of place and attitude, as the metadata state them
     """
@@ -348,14 +354,21 @@ def _camera_by_control(
     control = FrameControl(
         table["row"], table["column"], np.radians(table["lat_deg"]), np.radians(table["lon_deg"]), table["height_m"]
     )
+    top = float(model.ellipsoid.geodetic(model.position_e)[2])
+    table.refuse(control.height_m >= top, "height_m", lambda k: f"{control.height_m[k]:g}: the camera is at {top:g} m")
+    _refuse_elsewhere(table, model, image)
+    lost = np.isnan(model.direct(control.line, control.sample, control.height_m)).any(axis=1)
+    table.refuse(lost, "column, row", lambda k: f"the ray does not come down to {control.height_m[k]:g} m")
     height_m = GROUND_SIGMA_M if args.height_sigma is None else args.height_sigma
     try:
         return fit_frame(
-            model, control, TWELVE, pixel_sigma=args.pixel_sigma or CONTROL_SIGMA_PX, height_sigma_m=height_m,
+            model, control, THIRTEEN, pixel_sigma=args.pixel_sigma or CONTROL_SIGMA_PX, height_sigma_m=height_m,
             ground_sigma_m=height_m, prior_sigma=stated_priors(model, sigmas.position_m, sigmas.attitude_rad),
         )  # fmt: skip
     except ValueError as error:
-        raise UserError(f"{path}: {error}") from None
+        raise UserError(
+            f"{path}: {error}: wanted rows counted from above, columns from the left, and the camera of this image"
+        ) from None
 
 
 def _correction(args: argparse.Namespace, path: Path, model: Any, image: SourceImage) -> BiasFit:
@@ -363,11 +376,7 @@ def _correction(args: argparse.Namespace, path: Path, model: Any, image: SourceI
     u, v = table["row"], table["column"]
     lat, lon = np.radians(table["lat_deg"]), np.radians(table["lon_deg"])
     sigma = args.pixel_sigma or CONTROL_SIGMA_PX
-    # the image may be off by more than its size: the model alone says where a point would appear
-    wide = _Wide(image.lines, image.samples, model)
-    unseen = np.isnan(wide.inverse(lat, lon, table["height_m"])).any(axis=1)
-    place = "is not in the image, nor within its size of it; wanted longitude and latitude in degrees"
-    table.refuse(unseen, "lon_deg, lat_deg", lambda k: f"{table['lon_deg'][k]:g}, {table['lat_deg'][k]:g} {place}")
+    wide = _refuse_elsewhere(table, model, image)
     try:
         return fit_bias(
             wide,
@@ -382,6 +391,17 @@ def _correction(args: argparse.Namespace, path: Path, model: Any, image: SourceI
         )
     except ValueError as error:
         raise UserError(f"{path}: {error}") from None
+
+
+def _refuse_elsewhere(table: Any, model: Any, image: SourceImage) -> _Wide:
+    """Refuse control that the model sees nowhere near the image; the model that says so."""
+    # the image may be off by more than its size: the model alone says where a point would appear
+    wide = _Wide(image.lines, image.samples, model)
+    lat, lon = np.radians(table["lat_deg"]), np.radians(table["lon_deg"])
+    unseen = np.isnan(wide.inverse(lat, lon, table["height_m"])).any(axis=1)
+    place = "is not in the image, nor within its size of it; wanted longitude and latitude in degrees"
+    table.refuse(unseen, "lon_deg, lat_deg", lambda k: f"{table['lon_deg'][k]:g}, {table['lat_deg'][k]:g} {place}")
+    return wide
 
 
 @dataclass
@@ -562,6 +582,19 @@ def _error_map(args: argparse.Namespace, sensor: _Sensor) -> ErrorMap | None:
     return ErrorMap(Path(args.sigma), errors, float(height))
 
 
+def _for_people(fit: FrameFit) -> list[tuple[str, float, float, str]]:
+    """Parameters with their sigmas: turns in degrees, the place in metres."""
+    lat, _, h = fit.camera.ellipsoid.geodetic(fit.camera.position_e)
+    east, north = metres_a_radian(lat, h, fit.camera.ellipsoid)
+    units = {"lat": ("north", float(north), "m"), "lon": ("east", float(east), "m"), "h": ("up", 1.0, "m")}
+    units |= {name: (name, float(np.degrees(1.0)), "deg") for name in ("omega", "phi", "kappa")}
+    told = []
+    for name, value, sigma in zip(fit.names, fit.found.parameters, fit.found.sigma, strict=True):
+        word, factor, unit = units.get(name, (name, 1.0, UNITS[name]))
+        told.append((word, factor * float(value), factor * float(sigma), unit))
+    return told
+
+
 # -- what is told --------------------------------------------------------------------------------------------------
 
 
@@ -590,7 +623,7 @@ def _tell(
             "points": len(found.rejected), "rejected": int(found.rejected.sum()), "sigma0": found.sigma0,
             "redundancy": found.redundancy, "correction": args.correction,
             "parameters": {
-                name: {"change": float(x), "sigma": float(s)}
+                name: {"change": float(x), "sigma": float(s), "unit": UNITS[name]}
                 for name, x, s in zip(sensor.camera.names, found.parameters, found.sigma, strict=True)
             },
             "corrections": [
@@ -623,6 +656,8 @@ def _tell(
         print(
             f"  control: {len(found.rejected)} points, {out} rejected, sigma0 {found.sigma0:.2f}, {n} camera parameters"
         )
+        for name, value, sigma, unit in _for_people(sensor.camera):
+            print(f"    {name:9s} {value:12.5g} +- {sigma:.2g} {unit}")
     if not args.quiet:
         for note in sensor.notes:
             print(f"  note: {note}")

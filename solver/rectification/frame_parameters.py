@@ -28,12 +28,21 @@ PRIOR = {
 }  # fmt: skip
 #: Those of the second set; latitude and longitude stand for X and Y, in radians.
 TWELVE = ("f", "dx", "dy", "k1", "k2", "p1", "p2", "omega", "phi", "kappa", "lat", "lon")
-_PRIOR_12 = {"lat": 100.0 / 6.37e6, "lon": 100.0 / 6.37e6}
+#: The second set with the height of the perspective centre above the ellipsoid, which from an aircraft is no small part
+#: of the scale; for images whose metadata state how well all of their place is known.
+THIRTEEN = (*TWELVE, "h")
+_PRIOR_PLACE = {"lat": 100.0 / 6.37e6, "lon": 100.0 / 6.37e6, "h": 100.0}
+#: Units of the parameters.
+UNITS = {
+    "f": "mm", "dx": "mm", "dy": "mm", "c": "mm", "k1": "mm^-2", "k2": "mm^-4", "p1": "mm^-1", "p2": "mm^-1",
+    "omega": "rad", "phi": "rad", "kappa": "rad", "X": "m", "Y": "m", "Z": "m", "lat": "rad", "lon": "rad", "h": "m",
+}  # fmt: skip
 #: Size of a change of a parameter, in its sigmas, from which the steps of derivatives follow. Derived: 1e-5 of it moves
 #: the ground by much more than rounding, and by much less than it bends.
 _SCALE = 1e3
 #: Derived: places are known to a nanometre beside the radius of the Earth, which leaves 3e-8 of a sigma.
 _LAST_STEP = 1e-6
+_NOTHING_FITS = "no camera fits the points"
 
 
 def names_of(parameters: int) -> tuple[str, ...]:
@@ -50,11 +59,15 @@ def names_of(parameters: int) -> tuple[str, ...]:
 
 def prior_sigmas(parameters: int) -> Array:
     """(d,) of the parameters."""
-    return np.array([(PRIOR | _PRIOR_12)[name] for name in names_of(parameters)])
+    return _priors(names_of(parameters))
+
+
+def _priors(names: tuple[str, ...]) -> Array:
+    return np.array([(PRIOR | _PRIOR_PLACE)[name] for name in names])
 
 
 def stated_priors(camera: FrameCamera, position_m: ArrayLike, attitude_rad: ArrayLike) -> Array:
-    """(12,) sigmas of the second set, those of place and attitude as they are stated.
+    """(13,) sigmas of `THIRTEEN`, those of place and attitude as they are stated.
 
     Parameters
     ----------
@@ -65,10 +78,11 @@ def stated_priors(camera: FrameCamera, position_m: ArrayLike, attitude_rad: Arra
     R_el = LocalFrame(float(np.degrees(lat)), float(np.degrees(lon)), 0.0).R_el
     by_turn = angles_jacobian(angles_from_matrix(R_el.T @ camera.R_ec))
     angles = np.sqrt(np.square(by_turn) @ np.square(attitude_rad))
-    position = np.asarray(position_m, dtype=float)[[1, 0]] / [north, east]
-    stated: dict[str, float] = dict(zip(("omega", "phi", "kappa", "lat", "lon"), [*angles, *position], strict=True))
-    usual = prior_sigmas(len(TWELVE))
-    sigma = np.array([stated.get(name, 0.0) for name in TWELVE])
+    position = np.asarray(position_m, dtype=float)[[1, 0, 2]] / [north, east, 1.0]
+    names = ("omega", "phi", "kappa", "lat", "lon", "h")
+    stated: dict[str, float] = dict(zip(names, [*angles, *position], strict=True))
+    usual = _priors(THIRTEEN)
+    sigma = np.array([stated.get(name, 0.0) for name in THIRTEEN])
     return np.where(sigma > 0, sigma, usual)
 
 
@@ -77,27 +91,27 @@ def changed(camera: FrameCamera, changes: Mapping[str, float]) -> FrameCamera:
 
     Parameters
     ----------
-    changes : change of each parameter by its name, one of `PRIOR` or `TWELVE`, or ``k3``; angles are those in the local
-        frame at the place of ``camera``
+    changes : change of each parameter by its name, one of `PRIOR` or `THIRTEEN`, or ``k3``; angles are those in the
+        local frame at the place of ``camera``
 
     Raises
     ------
     KeyError : another name
     """
-    by = dict.fromkeys((*PRIOR, *_PRIOR_12, "k3"), 0.0)
+    by = dict.fromkeys((*PRIOR, *_PRIOR_PLACE, "k3"), 0.0)
     if not changes.keys() <= by.keys():
         raise KeyError(f"{min(changes.keys() - by.keys())} is no parameter of a frame camera")
     by |= changes
     C, R = camera.position_e, camera.R_ec
-    if any(by[name] for name in ("omega", "phi", "kappa", "lat", "lon")):
+    if any(by[name] for name in ("omega", "phi", "kappa", "lat", "lon", "h")):
         lat, lon, h = WGS84.geodetic(C)
         R_el = LocalFrame(float(np.degrees(lat)), float(np.degrees(lon)), 0.0).R_el
         if by["omega"] or by["phi"] or by["kappa"]:
             R = R_el @ matrix_from_angles(
                 *(angles_from_matrix(R_el.T @ R) + np.array([by["omega"], by["phi"], by["kappa"]]))
             )
-        if by["lat"] or by["lon"]:
-            C = WGS84.cartesian(lat + by["lat"], lon + by["lon"], h)
+        if by["lat"] or by["lon"] or by["h"]:
+            C = WGS84.cartesian(lat + by["lat"], lon + by["lon"], h + by["h"])
     lens = [by[name] for name in ("k1", "k2", "k3", "p1", "p2")]
     return FrameCamera(
         C + np.array([by["X"], by["Y"], by["Z"]]), R, camera.focal_length_mm + by["f"], camera.pixel_mm + by["c"],
@@ -114,13 +128,22 @@ class FrameFit:
     ----------
     camera : with the estimated parameters
     names : of the parameters
+    prior_sigma : of the parameters, as they were known beforehand
     found : parameters (changes against the start); corrections of line, sample (pixels), height, east and north
         (metres) with their sigmas, and two columns of zeros; points that the outlier test left out
     """
 
     camera: FrameCamera
     names: tuple[str, ...]
+    prior_sigma: Array
     found: MixedSolution
+
+    @property
+    def w(self) -> Array:
+        """Changes of the parameters over their sigmas, by what was known beforehand; 0 where nothing was."""
+        spread = np.sqrt(np.maximum(self.prior_sigma**2 - self.found.sigma**2, 0.0))
+        known = np.isfinite(spread) & (spread > 1e-6 * self.prior_sigma)
+        return np.where(known, self.found.parameters / np.where(known, spread, 1.0), 0.0)
 
 
 @dataclass(frozen=True)
@@ -158,7 +181,7 @@ def fit_frame(
     Parameters
     ----------
     camera : to start from; its values are what is known beforehand
-    names : of the parameters, see `names_of`
+    names : of the parameters, see `names_of` and `THIRTEEN`
     pixel_sigma, height_sigma_m, ground_sigma_m : of the observations
     prior_sigma : (d,) of what is known beforehand, infinite where nothing is
     constraints : parameter -> change that it has to have
@@ -174,9 +197,14 @@ def fit_frame(
     prior = np.asarray(prior_sigma, dtype=float)
 
     def conditions(beta: Array, observed: Array) -> Array:
-        other = changed(camera, dict(zip(names, beta.tolist(), strict=True)))
+        changes = dict(zip(names, beta.tolist(), strict=True))
         line, sample, height, e, n, lat, lon = observed.T
+        if camera.focal_length_mm + changes.get("f", 0.0) <= 0.0:
+            raise ValueError(_NOTHING_FITS)
+        other = changed(camera, changes)
         located = other.direct(line, sample, height)
+        if not np.isfinite(located).all():
+            raise ValueError(_NOTHING_FITS)
         east, north = metres_a_radian(lat, height, other.ellipsoid)
         return np.column_stack([(located[:, 1] - lon) * east - e, (located[:, 0] - lat) * north - n])
 
@@ -196,4 +224,4 @@ def fit_frame(
         _LAST_STEP,
     )
     found = estimate(model, snoop)
-    return FrameFit(changed(camera, dict(zip(names, found.parameters.tolist(), strict=True))), names, found)
+    return FrameFit(changed(camera, dict(zip(names, found.parameters.tolist(), strict=True))), names, prior, found)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 from dataclasses import replace
@@ -545,7 +546,78 @@ def test_parameters_of_a_frame_camera_by_control(tmp_path, capsys):
     assert main([*args, "--sigma", str(tmp_path / "s.tif")]) == 1
     assert "--sigma: goes with --correction shift or affine" in capsys.readouterr().err
     capsys.readouterr()
-    assert main([*args, "-q"]) == 0 and "12 camera parameters" in capsys.readouterr().out
+    assert main([*args, "-q"]) == 0
+    printed = capsys.readouterr().out
+    assert "13 camera parameters" in printed
+    _, value, _, sigma, unit = next(row.split() for row in printed.splitlines() if "omega" in row)
+    assert unit == "deg" and float(value) == pytest.approx(np.degrees(omega["change"]), rel=1e-3)
+    assert float(sigma) == pytest.approx(np.degrees(omega["sigma"]), rel=0.05) and omega["unit"] == "rad"
+
+
+def aerial_photograph(folder, off_m, sigma_up_m):
+    """A frame camera 2 km above relief whose metadata are that much too high; the true one, and control."""
+    folder.mkdir()
+    truth, rng = json.loads(json.dumps(FRAME)), np.random.default_rng(5)
+    truth["exterior"].update(height_m=3000.0, omega_phi_kappa_deg=[3.0, -2.0, 12.0])
+    (folder / "truth.json").write_text(json.dumps(truth))
+    camera, _ = read_frame(folder / "truth.json", [])
+    write_image(folder / "photo.tif", np.ones((1, camera.lines, camera.samples), np.float32), nodata=-1.0)
+    line, sample, height = rng.uniform(2, 297, 24), rng.uniform(2, 397, 24), rng.uniform(700, 1400, 24)
+    lat, lon, _ = np.degrees(camera.direct(line, sample, height)).T
+    line, sample = (a + 0.1 * rng.standard_normal(24) for a in (line, sample))
+    table = {"lon_deg": lon, "lat_deg": lat, "height_m": height, "column": sample, "row": line}
+    truth["exterior"]["height_m"] += off_m
+    truth["sigma"] = {"position_m": [1.0, 1.0, sigma_up_m], "attitude_deg": [0.02, 0.02, 0.02]}
+    (folder / "photo.json").write_text(json.dumps(truth))
+    return camera, table
+
+
+def rectify_photograph(folder, table):
+    control = folder / "control.csv"
+    rows = zip(*(np.asarray(a).tolist() for a in table.values()), strict=True)
+    control.write_text(",".join(table) + "\n" + "\n".join(",".join(map(repr, row)) for row in rows))
+    args = ["rectify", folder / "photo.tif", "--sensor", folder / "photo.json", "--height", 900, "--control", control]
+    args += ["--correction", "camera", "--pixel-sigma", 0.1, "--height-sigma", 0.001, "-o", folder / "o.tif", "--json"]
+    return main([str(a) for a in args])
+
+
+def test_control_finds_the_height_of_a_photograph(tmp_path, capsys):
+    """Stated to 20 m and 15 m too high: the focal length took it up, and sigma0 was 2 with all sigmas right."""
+    _, table = aerial_photograph(tmp_path / "p", 15.0, 20.0)
+    assert rectify_photograph(tmp_path / "p", table) == 0
+    result = json.loads(capsys.readouterr().out)
+    found = result["control"]
+    assert found["rejected"] == 0 and 0.6 < found["sigma0"] < 1.4
+    up, f = found["parameters"]["h"], found["parameters"]["f"]
+    assert up["unit"] == "m" and f["unit"] == "mm" and up["sigma"] < 5.0
+    assert abs(up["change"] + 15.0) < 3.5 * up["sigma"] and abs(f["change"]) < 3.5 * f["sigma"]
+    assert not [note for note in result["notes"] if "let expect" in note]
+    # known to half a metre it is not 15 m off: something else is wrong, and is named
+    _, table = aerial_photograph(tmp_path / "q", 15.0, 0.5)
+    assert rectify_photograph(tmp_path / "q", table) == 0
+    notes = json.loads(capsys.readouterr().out)["notes"]
+    assert [n for n in notes if re.match(r"control: (up|f) [-+][\d.]+ m+: [\d.]+ times what photo.json, or usual", n)]
+
+
+@pytest.mark.parametrize(
+    ("how", "told"),
+    [
+        ("swapped", r"control.csv:2: lon_deg, lat_deg: 39.\d+, 32.\d+ is not in the image, nor within its size of it"),
+        ("above", r"control.csv:2: height_m: 1\d{4}.*: the camera is at 3000 m"),
+        ("from below", r"control.csv: .*no.*: wanted rows counted from above"),
+    ],
+)
+def test_control_that_no_photograph_fits_is_refused_by_its_row(how, told, tmp_path, capsys):
+    """It was "focal length -299.3" and "point 0: its condition is not a number"."""
+    _, table = aerial_photograph(tmp_path / "p", 0.0, 1.0)
+    if how == "swapped":
+        table["lon_deg"], table["lat_deg"] = table["lat_deg"], table["lon_deg"]
+    elif how == "above":
+        table["height_m"] = table["height_m"] + 10_000.0
+    else:
+        table["row"] = 299.0 - table["row"]
+    assert rectify_photograph(tmp_path / "p", table) == 1
+    assert re.search(told, capsys.readouterr().err)
 
 
 def test_control_corrects_a_frame_camera_by_what_it_states_to_be_uncertain(tmp_path, capsys):
