@@ -40,7 +40,9 @@ def write_page(path: Path, result: dict[str, Any]) -> None:
         result=result,
         figures=drawn,
         all_tiles=_tiles(result),
-        flights=[_cells(row) for row in rows],
+        heads=_heads(rows),
+        flights=[_cells(row, adjusted=_adjusted(rows)) for row in rows],
+        adjusted=_adjusted(rows),
         failures=[cells for row in rows for cells in _failures(row)],
         incomplete=[[row["flight"], "; ".join(row["incomplete"])] for row in rows if row["incomplete"]],
         damaged=[[row["flight"], "; ".join(row["damage"])] for row in rows if row["damage"]],
@@ -85,9 +87,23 @@ def _mood(row: dict[str, Any]) -> str:
     return max(LIGHTS, key=lambda name: share.get(name, 0.0)) if share else ""
 
 
-def _cells(row: dict[str, Any]) -> list[Any]:
-    rmse, adjusted = row["rmse_m"] or (None,) * 3, row["adjust"] or {}
-    check = adjusted.get("check_rmse_m") or (None,) * 3
+def _adjusted(rows: Sequence[dict[str, Any]]) -> bool:
+    """Whether any flight was adjusted in a batch."""
+    return any(row["adjust"] for row in rows)
+
+
+def _heads(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Heads of the columns of `_cells`."""
+    adjusted = ["adjusted: sigma0", "RMSE X, m", "Y, m", "Z, m"] if _adjusted(rows) else []
+    return [
+        "flight", "state", "camera", "flown, s", "strips", "rays", "rejected", "sigma0", "NEES", "good / weak / failed",
+        "RMSE X, m", "Y, m", "Z, m", *adjusted, "files",
+    ]  # fmt: skip
+
+
+def _cells(row: dict[str, Any], adjusted: bool) -> list[Any]:
+    rmse, batch = row["rmse_m"] or (None,) * 3, row["adjust"] or {}
+    check = batch.get("check_rmse_m") or (None,) * 3
     report = row["steps"].get("analyze", {}).get("output")
     others = [
         Markup('<a href="{}">{}</a>').format(quote(step["output"]), name)
@@ -97,16 +113,16 @@ def _cells(row: dict[str, Any]) -> list[Any]:
     return [
         Markup('<a href="{}">{}</a>').format(quote(report), row["flight"]) if report else row["flight"],
         row["state"],
+        row["camera"],
         number(row["seconds"], 1),
         row["strips"],
         row["rays"],
         row["rejected"],
         number(row["sigma0"], 3),
         number(row["nees"], 2),
-        light_words(row["light"]),
+        light_words(row["light"]) if row["light"] else None,
         *(number(v, 3) for v in rmse),
-        number(adjusted.get("sigma0"), 3),
-        *(number(v, 3) for v in check),
+        *((number(batch.get("sigma0"), 3), *(number(v, 3) for v in check)) if adjusted else ()),
         Markup(" ").join(others),
     ]
 

@@ -20,9 +20,9 @@ from .integrity import LIGHTS
 #: So many rows are printed; the files have all.
 MOST_LINES = 60
 _COLUMNS = (
-    "flight", "state", "seconds", "strips", "rays", "rejected", "sigma0", "nees", "good", "weak", "failed", "rmse_X_m",
-    "rmse_Y_m", "rmse_Z_m", "against", "adjust_sigma0", "adjust_rejected", "damage", "incomplete",
-    "reason", "recording",
+    "flight", "state", "camera", "seconds", "strips", "rays", "rejected", "sigma0", "nees", "good", "weak", "failed",
+    "rmse_X_m", "rmse_Y_m", "rmse_Z_m", "against", "adjust_sigma0", "adjust_rejected", "adjust_rmse_X_m",
+    "adjust_rmse_Y_m", "adjust_rmse_Z_m", "damage", "incomplete", "reason", "recording",
 )  # fmt: skip
 
 
@@ -38,6 +38,7 @@ def flight_rows(plans: Sequence[Plan], progress: Progress) -> list[dict[str, Any
       ``incomplete``: nodes whose work failed at some messages, a line each;
     - ``steps``: by name ``state`` ("finished", "failed", "not begun"), ``reason``, ``seconds`` (of the job),
       ``attempts``, ``output`` and ``log`` (paths below the folder of results, None where they are not);
+    - ``camera``: its name;
     - ``seconds, strips, rays, rejected, sigma0, nees, light`` (shares of LIGHTS in ``lit_s``, the time on strips),
       ``rmse_m`` (X, Y, Z) of object points
       ``against`` "truth" or "check points", ``tracks``: of the report, see `analysis.analyse`; None without one;
@@ -65,6 +66,7 @@ def _row(plan: Plan, progress: Progress) -> dict[str, Any]:
         "damage": next(filter(None, map(_damage, told.values())), []),
         "incomplete": [f"{node} {text}" for node, text in (told.get("process", {}).get("failed") or {}).items()],
         "steps": steps,
+        "camera": held.get("camera"),
         "seconds": held.get("seconds"),
         "strips": held.get("strips"),
         "rays": held.get("rays"),
@@ -124,11 +126,13 @@ def write_tables(out: Path, result: dict[str, Any]) -> None:
     writer.writerow(_COLUMNS)
     for row in result["flights"]:
         light, rmse, adjusted = row["light"] or {}, row["rmse_m"] or (None,) * 3, row["adjust"] or {}
+        check = adjusted.get("check_rmse_m") or (None,) * 3
         cells = {
             **row, **{key: "; ".join(row[key]) or None for key in ("damage", "incomplete")},
             **{name: light.get(name) for name in LIGHTS},
             "rmse_X_m": rmse[0], "rmse_Y_m": rmse[1], "rmse_Z_m": rmse[2],
             "adjust_sigma0": adjusted.get("sigma0"), "adjust_rejected": adjusted.get("rejected"),
+            **{f"adjust_rmse_{axis}_m": value for axis, value in zip("XYZ", check, strict=True)},
         }  # fmt: skip
         writer.writerow("" if cells[name] is None else cells[name] for name in _COLUMNS)
     write_whole(out / "summary.csv", file.getvalue())

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import csv
+import re
+from pathlib import Path
 from typing import Any
 
-from triline.nodes.report.batch_page import _map, _tiles
+from triline.nodes.report.batch_page import _map, _tiles, write_page
+from triline.nodes.report.batch_rows import write_tables
 from triline.nodes.report.style import styled
 
 
@@ -35,3 +39,29 @@ def test_flights_at_one_place_are_named_once_and_seen_beside_one_far_away():
     names = [text.get_text() for text in axes.texts]
     assert sorted(names) == ["b + 2", "south"]
     assert all(line.get_marker() == "." for line in axes.get_lines())
+
+
+def flown_with(camera: str, adjusted: bool) -> dict[str, Any]:
+    nothing = dict.fromkeys(("damage", "incomplete", "reason", "recording", "tracks"))
+    batch = {"sigma0": 1.02, "rejected": 3, "check_rmse_m": [0.1234, 0.2345, None]} if adjusted else None
+    return {
+        **row(1.0, 60.0, 60.0), **nothing, "damage": [], "incomplete": [], "flight": camera, "camera": camera,
+        "strips": 2, "rays": 100, "rejected": 1, "rmse_m": [0.5, 0.6, 0.7], "against": "truth", "steps": {},
+        "adjust": batch,
+    }  # fmt: skip
+
+
+def test_page_and_table_say_what_camera_flew_and_the_same_of_the_adjustment(tmp_path: Path):
+    """Check points of the adjustment stood on the page alone, and its columns also where nothing had been adjusted."""
+    for adjusted in (False, True):
+        rows = [flown_with("ads40", adjusted), flown_with("si-100", False)]
+        result = {"flights": rows, "jobs": {"failed": 0, "now": 2, "earlier": 0}, "seconds": 1.0}
+        write_page(tmp_path / "index.html", result)
+        write_tables(tmp_path, result)
+        page = (tmp_path / "index.html").read_text()
+        heads, *flights = re.findall(r"<tr>(.*?)</tr>", page[page.index("<th>camera</th>") - 99 :], re.DOTALL)[:3]
+        assert [len(re.findall("<td", line)) for line in flights] == [heads.count("<th")] * 2
+        assert ("adjusted: sigma0" in heads) == adjusted == ("0.123</td>" in page)
+        one, other = csv.DictReader((tmp_path / "summary.csv").read_text().splitlines())
+        assert (one["camera"], other["camera"]) == ("ads40", "si-100")
+        assert one["adjust_rmse_X_m"] == ("0.1234" if adjusted else "") and one["adjust_rmse_Z_m"] == ""

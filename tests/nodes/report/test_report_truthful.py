@@ -142,6 +142,17 @@ def test_equal_figures_are_told_once_and_a_ccd_line_without_residuals_has_no_axe
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_a_rejected_ray_to_which_no_test_applied_has_no_test_value(recording):
+    """Rays without orientation had a w of 0.0, as if they fitted perfectly."""
+    flight, held = read(recording)
+    lost = m.RejectedObservation(point="T1", strip="S1", ccd="N", line=5.0, sample=7.0, reason="no orientation")
+    flight.rejected = [lost, m.RejectedObservation(point="T2", strip="S1", ccd="N", line=6.0, sample=8.0, w=-9.04)]
+    text = page(flight, analyse(flight, held))
+    rows = re.findall(r"<td>(T[12])</td>.*<td>(\S+)</td></tr>", text[text.index("Rejected observations") :])
+    assert rows == [("T2", "-9.0"), ("T1", "–")]
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_terminal_headline_tile_and_highlighted_row_say_the_same(recording):
     flight, held = read(recording)
     result = analyse(flight, held)
