@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from .style import svg
 
 _DPI = 160
-_MOST_CHARACTERS = 80  # of the columns of a table of statistics in letters of usual size
+_MOST_CHARACTERS = 76  # of the columns of a table of statistics in letters of usual size
 
 
 def render(template: str, **values: Any) -> str:

@@ -121,9 +121,9 @@ def test_an_old_report_stays_when_the_new_one_fails(tmp_path, capsys):
 # ---- one kind of figure
 
 
-@pytest.mark.parametrize(("metres", "small"), [(0.05, False), (99.9, False), (1429.5, True)])
+@pytest.mark.parametrize(("metres", "small"), [(0.05, False), (99.9, False), (164.6, True), (1429.5, True)])
 def test_a_table_of_large_figures_is_set_small(metres, small):
-    """Of MISR, its last columns were out of sight."""
+    """Of MISR, its last columns were out of sight; of a PRISM block with 164.617 m the NEES."""
     groups = [(key, key, 3) for key in ("rmse_m", "mean_m", "max_m", "sigma_m")]
     rows = {"final": {key: [-0.01, metres / 9, -metres] for _, key, _ in groups}, "measured": {"rmse_m": [0.0] * 3}}
     assert needs_room(rows, groups) is small
