@@ -95,6 +95,12 @@ def read_scene_folder(path: Path) -> SatelliteScene:
         notes,
     )
     ephemeris = read_table(path / "ephemeris.csv", _EPHEMERIS, notes)
+    away = np.linalg.norm(ephemeris.stack("X_m", "Y_m", "Z_m"), axis=1)
+    ephemeris.refuse(
+        away < settings.ellipsoid.semi_minor_m,
+        "X_m, Y_m, Z_m",
+        lambda k: f"{away[k]:.0f} m from the centre of the planet, which is inside it; wanted metres from there",
+    )
     attitude = read_table(path / "attitude.csv", _ATTITUDE, notes)
     line_ns, orbit_ns, attitude_ns = (_stamps(table, settings) for table in (times, ephemeris, attitude))
     reference, first, last = int(line_ns[0]), int(line_ns.min()), int(line_ns.max())

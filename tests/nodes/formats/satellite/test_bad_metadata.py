@@ -121,6 +121,16 @@ def test_isd(change, match, tmp_path):
     refused(path, match)
 
 
+def in_kilometres(rows):
+    """An ephemeris with its positions in kilometres."""
+    cells = [row.split(",") for row in rows]
+    place = [k for k, name in enumerate(cells[0]) if name in ("X_m", "Y_m", "Z_m")]
+    for row in cells[1:]:
+        for k in place:
+            row[k] = repr(float(row[k]) / 1000.0)
+    return [",".join(row) for row in cells]
+
+
 def lines(name, change):
     def apply(folder):
         rows = (folder / name).read_text().splitlines()
@@ -138,6 +148,11 @@ def lines(name, change):
             r"ephemeris.csv:4: Z_m: missing",
         ),
         (lines("ephemeris.csv", lambda r: [*r[:3], r[2], *r[4:]]), "ephemeris.csv:4: time: does not follow the time"),
+        # of such a scene a block was adjusted, "sigma0 1.0000, passed, converged", by nothing
+        (
+            lines("ephemeris.csv", in_kilometres),
+            r"ephemeris.csv:2: X_m, Y_m, Z_m: 7\d{3} m from the centre of the planet, which is inside it; wanted",
+        ),
         (lines("attitude.csv", lambda r: [*r[:5], *r[9:]]), "attitude.csv: time: gap from .* every 0.5 s"),
         (
             lines("attitude.csv", lambda r: [r[0].replace("yaw", "jaw"), *r[1:]]),
