@@ -51,9 +51,11 @@ def _head(c: Content) -> Iterator[str]:
     )
     test = c["chi_square_test"]
     verdict = "passed" if test["passed"] else "FAILED"
-    low, high = _number(test["low"]), _number(test["high"])
+    tested = f"chi-square 95 %: {_number(test['low'])} to {_number(test['high'])}, {verdict}"
+    if c["redundancy"] <= 0:
+        tested = "taken, not found: nothing is redundant, and nothing tested"
     yield (
-        f"sigma0 {c['sigma0']:.4f} = {c['sigma0_px']:.4f} px (chi-square 95 %: {low} to {high}, {verdict}), "
+        f"sigma0 {c['sigma0']:.4f} = {c['sigma0_px']:.4f} px ({tested}), "
         f"{c['iterations']} iterations, {'converged' if c['converged'] else 'NOT CONVERGED'}, {c['seconds']:.2f} s"
     )
 

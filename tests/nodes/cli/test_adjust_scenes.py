@@ -15,6 +15,7 @@ import pytest
 from full_disk import files_of_at_most
 from satellite_scenes import Truth, write_dimap1, write_dimap2, write_isd
 
+from triline.nodes.batch.adjustment_summary import summary_lines
 from triline.nodes.cli import main
 from triline.nodes.formats.satellite.read import read_scene
 from triline.nodes.formats.satellite.rpc_files import write_rpb
@@ -283,6 +284,15 @@ def test_control_that_lost_its_image_points_is_named(block, capsys):
     result = json.loads(capsys.readouterr().out)
     assert 0.8 < result["sigma0"] < 1.2 and result["control"]["n"] == 8
     assert any(f"lost all its image points and stands as given: {wrong};" in note for note in result["notes"])
+
+
+def test_a_test_of_nothing_has_not_passed(block, capsys):
+    """Of a block whose rays had all gone: "chi-square 95 %: 0.000 to -, passed"."""
+    assert main(["adjust", str(block), "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    content |= {"redundancy": 0, "sigma0": 1.0, "chi_square_test": {"low": 0.0, "high": None, "passed": True}}
+    head = list(summary_lines(content))[2]
+    assert "passed" not in head and "(taken, not found: nothing is redundant, and nothing tested)" in head
 
 
 def swapped(path, which):
