@@ -42,7 +42,7 @@ def write_page(path: Path, results: Sequence[dict[str, Any]], maps: Sequence[Sce
             }
             for result, found in zip(results, maps, strict=True)
         ]
-    path.write_text(render("sensitivity.html", scenes=drawn), encoding="utf-8")
+    path.write_text(render("sensitivity.html", scenes=drawn, degrees=float(np.degrees(1.0))), encoding="utf-8")
 
 
 def _row_names(result: dict[str, Any], found: SceneMap) -> list[str] | None:
@@ -88,9 +88,8 @@ def _map(found: SceneMap, row_names: list[str] | None) -> Figure | None:
     for i, j in np.argwhere(found.dominating >= 0):
         if found.dominating.size <= 200:
             k = found.dominating[i, j]
-            right.text(
-                j, i, f"{100 * found.share[i, j, k]:.0f} %", ha="center", va="center", fontsize=5.5, color="white"
-            )
+            color = "white" if image.norm(found.sigma[i, j]) < 0.7 else "black"  # viridis ends in yellow
+            right.text(j, i, f"{100 * found.share[i, j, k]:.0f} %", ha="center", va="center", fontsize=5.5, color=color)
     right.grid(visible=False)
     some = np.unique(np.linspace(0, len(found.columns) - 1, 5).round().astype(int))
     right.set_xticks(some, [f"{found.columns[k]:.0f}" for k in some])

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 
+import numpy as np
 import pandas as pd
 import pytest
 from satellite_scenes import Truth, write_dimap2, write_folder
 
 from triline.nodes.cli import main
+from triline.nodes.report.sensitivity_page import _map
+from triline.nodes.report.style import styled
+from triline.solver.sensitivity.scene_map import SceneMap
 
 FEW = ["--runs", "6000", "--samples", "512"]
 
@@ -60,6 +65,18 @@ def test_maps_of_the_scene(tmp_path, capsys):
     text = page.read_text()
     assert text.count("<svg") == 2 * 3 and "src=" not in text and "<script" not in text
     assert "line of detectors N" in text
+    # as on the terminal: sigmas of attitudes were 8.727e-06 rad
+    assert re.search(r"<tr><td>roll</td><td>0.0005</td><td>deg</td>", text) and "<td>rad</td>" not in text
+
+
+def test_shares_are_read_on_dark_and_on_bright_cells():
+    """They were white on yellow, too."""
+    covariance = np.array([1.0, 4.0, 9.0]).reshape(1, 3, 1, 1) * np.eye(2)
+    found = SceneMap(np.arange(3.0), np.zeros(1), covariance, np.ones((1, 3, 1)), ("height",))
+    with styled():
+        drawn = _map(found, None)
+    assert drawn is not None
+    assert [text.get_color() for text in drawn.axes[1].texts] == ["white", "white", "black"]
 
 
 def test_a_scene_from_a_file(tmp_path, capsys):
