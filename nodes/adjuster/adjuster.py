@@ -13,7 +13,7 @@ from ...solver.camera.line_camera import finest_pixel
 from ...solver.camera.self_calibration import LEFT, SELF_CALIBRATIONS
 from ...solver.models.platform import MOST_CLOCK_S, MOST_LEVER_ARM_M, USUAL_PLATFORM, PlatformErrors
 from ...solver.window.output import WindowUpdate
-from ...solver.window.results import Look, Refusal, WindowOptions
+from ...solver.window.results import DivergedError, Look, Refusal, WindowOptions
 from ...solver.window.window import Window
 from .. import convert
 from ..errors import UserError
@@ -192,12 +192,18 @@ class Adjuster(Node):
 
     def step(self, message: Message) -> Iterable[Message]:
         self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
-        outputs = self._begin_pace(message.stamp_ns) + self._update_if_due(message.stamp_ns)
+        outputs = self._begin_pace(message.stamp_ns)
+        try:
+            outputs += self._update_if_due(message.stamp_ns)
+        except DivergedError as error:
+            outputs += self._begin_anew(str(error))
         try:
             outputs += self._take(message)
             outputs += self._update_for_waiting(message.stamp_ns)
         except ValueError as error:
             self.refuse("malformed", f"{message.topic}: {error}")
+        except DivergedError as error:
+            outputs += self._begin_anew(str(error))
         return outputs
 
     def behind(self, lag_s: float, now_s: float, busy_s: float) -> Iterable[Message]:
@@ -218,9 +224,12 @@ class Adjuster(Node):
         if self._early:
             self._hand_over_poses()
             self._take_ties()
-        else:  # what the smoother still held reaches further than the last update
-            outputs += self._update(self._stamp_ns)
-        return outputs + self._results(self._window.finish())
+        try:
+            if not self._early:  # what the smoother still held reaches further than the last update
+                outputs += self._update(self._stamp_ns)
+            return outputs + self._results(self._window.finish())
+        except DivergedError as error:
+            return outputs + self._begin_anew(str(error))
 
     def state(self) -> str:
         if self._window is not None:
@@ -289,6 +298,22 @@ class Adjuster(Node):
         if self._project is None or self._camera is None:
             return []
         again = self._window is not None
+        told = self._begin_window(stamp_ns, another_frame)
+        if not again:
+            return told
+        words = "configuration changed: the window starts again"
+        if another_frame:
+            self.counters["another local frame"] += 1
+            words += (
+                "; its local frame has another origin or CRS than before, so results from now on do not go with those "
+                "before, and control has to be stated in it"
+            )
+            if given_up:
+                words += f" ({given_up} ground points do not count until they are stated again)"
+        return [*told, self._log(words, warning=True)]
+
+    def _begin_window(self, stamp_ns: int, another_frame: bool = False) -> list[Message]:
+        """A window with nothing in it but the strips and the control that are known; what there is to say of it."""
         self._reference_ns = stamp_ns // convert.SECOND_NS * convert.SECOND_NS
         camera = convert.camera_from(self._camera)
         parameters = None
@@ -306,18 +331,13 @@ class Adjuster(Node):
             self._begin(strip)
         for point in self._control.bodies.values():
             self._control.take(point, self._window)
-        if not again:
-            return told
-        words = "configuration changed: the window starts again"
-        if another_frame:
-            self.counters["another local frame"] += 1
-            words += (
-                "; its local frame has another origin or CRS than before, so results from now on do not go with those "
-                "before, and control has to be stated in it"
-            )
-            if given_up:
-                words += f" ({given_up} ground points do not count until they are stated again)"
-        return [*told, self._log(words, warning=True)]
+        return told
+
+    def _begin_anew(self, why: str) -> list[Message]:
+        """The window has diverged: what is final stays, what is not is given up."""
+        self.problem("diverged", why)
+        words = f"{why}: the window begins anew without what was in it; are many of the tie points or poses wrong?"
+        return [*self._begin_window(self._stamp_ns), self._log(words, warning=True)]
 
     def _surface(self) -> tuple[SurfaceControl | None, list[Message]]:
         """The elevation model that tie points lie on, if there is one, in the frame of the project; what there is to

@@ -11,7 +11,7 @@ import numpy as np
 from ..adjustment.layout import SURFACE_SHIFT
 from ..arrays import Array, IntArray
 from ..camera.self_calibration import unit_of
-from ..geometry.rotation import corrected_angles
+from ..geometry.rotation import corrected_angles, matrix_from_angles
 from ..geometry.trajectory import Poses
 from ..models.base import COMPONENTS
 from .datum.drift_monitor import DriftMonitor
@@ -99,6 +99,15 @@ class OrientationOutput:
         return RefinedOrientation(
             strip.id, times, measured.poses.position_l + correction[:, :3], angles, covariance, correction
         )
+
+    def turn(self, strip: WindowStrip, time_s: float) -> float:
+        """Angle, rad, by which the solution turns the measured attitude at a time that has one."""
+        measured = self._network.trajectory.at(np.array([time_s])).poses
+        columns, A = strip.design(np.array([time_s]), measured).functions()
+        correction = A @ self._network.state.values(columns)
+        both = np.vstack([measured.angles, corrected_angles(measured.angles, correction[:, 3:])])
+        before, after = matrix_from_angles(*both.T)
+        return float(np.arccos(np.clip(0.5 * (np.sum(before * after) - 1.0), -1.0, 1.0)))
 
     def noise(self, strip: WindowStrip, times: Array) -> Array:
         """Covariance (n, 6, 6) that comes from no unknown: measurement noise and what the model leaves out."""

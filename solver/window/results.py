@@ -15,6 +15,10 @@ from ..models import MODELS
 DATUMS = ("control", "gnss")
 
 
+class DivergedError(ArithmeticError):
+    """The solution of the window has left what is plausible, and does not come back to it: a window begins anew."""
+
+
 @dataclass(frozen=True)
 class WindowOptions:
     """Settings of the sliding window.

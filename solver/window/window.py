@@ -32,7 +32,7 @@ from .leaving import Leaving
 from .output import CostHistory, OrientationOutput, WindowReport, WindowUpdate, parameters
 from .quality.light import Fit
 from .quality.quality_control import QualityControl
-from .results import Look, RefinedOrientation, WindowOptions
+from .results import DivergedError, Look, RefinedOrientation, WindowOptions
 from .screening.arriving import SINGLE_VIEW_WINDOW_S, Arrivals, usual_length
 from .screening.consensus import ConsensusSchedule, consensus_weights
 from .screening.disagreement import Disagreement
@@ -58,6 +58,10 @@ USUAL_DELAY_S = 2.0
 #: in a wide search, with that many lines around them, which is long where few lines a second come. Tuned: with 80 px of
 #: reach a strip was found within 320 lines; the seconds bound the work of an update.
 WAITED_LINES, MOST_WAITED_S = 400, 60.0
+#: A solution that turns the measured attitude by more, rad, beside so many times what is stated of its slow errors, has
+#: diverged: no attitude is measured so badly, and equations that are linear in its correction hold no more. Tuned:
+#: where a quarter of the looks is wrong it went from 5 to 60 deg in three seconds, and did not come back.
+MOST_TURNED, STATED_COUNTS = 0.5, 5.0
 #: Rays tested again in one update at most, if there is more than one batch.
 MOST_RETESTED = 100
 #: Time between two looks at what corrections leave of the noise of poses, s.
@@ -247,6 +251,10 @@ class Window:
         Parameters
         ----------
         now_s : platform time, s; one that lies before the last counts as the last
+
+        Raises
+        ------
+        DivergedError : the solution has left what is plausible; nothing can be done with this window any more
         """
         self._now_s = max(self._now_s, now_s)
         self._number += 1
@@ -265,6 +273,7 @@ class Window:
             due = joined or (self._due_for_test() if RETEST in duties else [])
             iterations += self._screen(fresh, fresh + due, result)
             iterations += self._weigh_control(fresh, result)
+        self._refuse_nonsense(fresh)
         self._judge(joined)
         self._learn_noise()
         self._publish(fresh, result)
@@ -403,6 +412,23 @@ class Window:
             self._relinearisation.reweigh()
             self.state.solve()
             self._orientation.forget()
+
+    def _refuse_nonsense(self, fresh: list[Batch]) -> None:
+        """Whether the attitude has been turned by more than any measured one can be wrong.
+
+        Raises
+        ------
+        DivergedError : it has
+        """
+        strip = self.strip_at(self._newest_ray_s) if fresh else None
+        if strip is None or not self.trajectory.covers([self._newest_ray_s])[0]:
+            return
+        turn, stated = (
+            self._orientation.turn(strip, self._newest_ray_s),
+            float(np.linalg.norm(strip.slow.attitude_sigma)),
+        )
+        if turn > MOST_TURNED + STATED_COUNTS * stated:
+            raise DivergedError(f"the solution turns the measured attitude by {np.degrees(turn):.0f} deg")
 
     def _publish(self, fresh: list[Batch], result: WindowUpdate) -> None:
         """The points of new batches, as they come out at once."""

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.linalg import get_lapack_funcs
 
 from ...arrays import Array
+from ..results import DivergedError
 from ..state.strip import WindowStrip
 from ..state.unknowns import WindowState, block_of
 
@@ -187,6 +188,10 @@ def likely(cost: Likelihood, present: tuple[float, float]) -> tuple[float, float
     ----------
     cost : of a choice of factors
     present : factors in force
+
+    Raises
+    ------
+    DivergedError : none of them has a likelihood that is a number
     """
     banks = BANK, BANK, NOISES if cost.noise is not None else (1.0,)
     most = tuple(len(bank) for bank in banks)
@@ -203,6 +208,8 @@ def likely(cost: Likelihood, present: tuple[float, float]) -> tuple[float, float
         near = sorted(c for c in beside if min(c) >= 0 and all(i < n for i, n in zip(c, most, strict=True)))
         seen.update(near)
         waiting.extend(near)
+    if not np.isfinite(least):
+        raise DivergedError("no sigma of the trajectory makes the tie points likely")
     weight = np.exp(-0.5 * (costs - least))
     weight /= weight.sum()
     square = [

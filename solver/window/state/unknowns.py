@@ -11,6 +11,7 @@ from scipy.linalg import get_lapack_funcs, solve_triangular
 
 from ...adjustment.reduced_system import DenseFactor
 from ...arrays import Array, Bools, IntArray
+from ..results import DivergedError
 
 #: Weight of what is held, which makes its cofactors nothing.
 HELD_WEIGHT = 1e30
@@ -416,15 +417,32 @@ class WindowState:
 
     @property
     def factor(self) -> DenseFactor:
+        """Of all information.
+
+        Raises
+        ------
+        DivergedError : it holds what is no number
+        """
         if self._factor is None:
-            self._factor = DenseFactor(self._fixed + self._live)
+            try:
+                self._factor = DenseFactor(self._fixed + self._live)
+            except np.linalg.LinAlgError as error:
+                raise DivergedError("the normal equations are no numbers any more") from error
         return self._factor
 
     def solve(self) -> None:
-        """Values from all information, if they are not."""
+        """Values from all information, if they are not.
+
+        Raises
+        ------
+        DivergedError : they are no numbers
+        """
         if self._solved:
             return
-        self.theta = self.factor.solve(self._fixed_rhs + self._live_rhs)
+        theta = self.factor.solve(self._fixed_rhs + self._live_rhs)
+        if not np.isfinite(theta).all():
+            raise DivergedError("the solution is no number any more")
+        self.theta = theta
         self._solved = True
         self.solution += 1
 
