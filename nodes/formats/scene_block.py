@@ -66,8 +66,10 @@ _OUTSIDE_PX = 0.5
 #: off, but polynomials say anything of another continent; half a degree of attitude from 830 km up is less than the
 #: second.
 _OTHER_PLACE_M, _OTHER_SCENE_M = 1_000_000.0, 10_000.0
-#: Both are at least so many sigmas of place and attitude, these from so many metres up.
-_OTHER_SIGMAS, _UP_M = 5.0, 8e5
+#: Both are at least so many sigmas of what the metadata and the point are known to.
+_OTHER_SIGMAS = 5.0
+#: The height of a point that needs none is known to that of the highest mountains, m.
+_RELIEF_M = 9_000.0
 #: Rows that cannot be used and are named one by one.
 _MOST_NAMED = 5
 
@@ -201,6 +203,13 @@ class SceneBlockData:
             found["shift_sigma_deg"] = _largest(turns, DEFAULTS["shift_sigma_deg"]).tolist()
         return {**DEFAULTS, **found, **self.trajectory}
 
+    @property
+    def rpc_sigmas_px(self) -> tuple[float, float]:
+        """Of the shift and the slope that correct polynomials."""
+        usual = {"shift_sigma_px": SHIFT_SIGMA_PX, "slope_sigma_px": SLOPE_SIGMA_PX}
+        shift, slope = (float(str(self.rpc.get(key, value))) for key, value in usual.items())
+        return shift, slope
+
     def block(self, images: tuple[ImageModel, ...]) -> SceneBlock:
         """The block of images made of `images`, in the same order."""
         return SceneBlock(images, self.point_ids, self.rays, self.known(), self.ellipsoid)
@@ -210,8 +219,7 @@ class SceneBlockData:
         if entry.scene.model == "rpc":
             assert isinstance(entry.location, Rpc)
             affine = self.rpc.get("correction", "affine") == "affine"
-            shift = float(str(self.rpc.get("shift_sigma_px", SHIFT_SIGMA_PX)))
-            slope = float(str(self.rpc.get("slope_sigma_px", SLOPE_SIGMA_PX)))
+            shift, slope = self.rpc_sigmas_px
             assumed = "shift_sigma_px" not in self.rpc, "slope_sigma_px" not in self.rpc
             return RpcImage(entry.name, entry.location, affine, shift, slope, entry.size_px, self.ellipsoid, assumed)
         return ProjectiveImage(entry.name, entry.scene.model, entry.size_px, self.ellipsoid)
@@ -462,34 +470,67 @@ def _refuse_other_places(path: Path, data: SceneBlockData) -> None:
     position = ground.xyz_l @ data.frame.R_el.T + data.frame.origin_e
     height = ellipsoid.geodetic(position)[:, 2] if len(ground) else np.empty(0)
     placed = np.array([role != "height" for role in ground.role], dtype=bool)
-    away = np.full(len(ground), np.inf)
+    sigma = np.sqrt(np.einsum("nii->n", ground.covariance))
+    sigma_up = np.where([role == "planimetric" for role in ground.role], _RELIEF_M, sigma)
+    away, known_to = np.full(len(ground), np.inf), np.zeros(len(ground))
     for k, image in enumerate(data.images):
         mine = np.flatnonzero((data.rays.image == k) & (data.rays.point < len(ground)))
         mine = mine[placed[data.rays.point[mine]]]
         if image.scene.model not in ("rigorous", "rpc") or not len(mine):  # the others know nothing beforehand
             continue
-        point = data.rays.point[mine]
+        point, line, sample = data.rays.point[mine], data.rays.line[mine], data.rays.sample[mine]
         with np.errstate(all="ignore"):  # a ray that misses the ground says nothing
-            lat, lon, _ = image.location.direct(data.rays.line[mine], data.rays.sample[mine], height[point]).T
+            lat, lon, _ = image.location.direct(line, sample, height[point]).T
             off = np.linalg.norm(ellipsoid.cartesian(lat, lon, height[point]) - position[point], axis=1)
+            by_metadata, by_height = _known_to(data, image, line, sample, height[point])
         np.fmin.at(away, point, off)
+        np.fmax.at(known_to, point, np.hypot(np.hypot(by_metadata, sigma[point]), by_height * sigma_up[point]))
     seen = np.flatnonzero(np.isfinite(away))
     if not len(seen):
         return
-    settings = data.trajectory_settings()
-    place, turn = (np.max(np.asarray(settings[key], dtype=float)) for key in ("offset_sigma_m", "shift_sigma_deg"))
-    most = _OTHER_SIGMAS * float(place + np.radians(turn) * _UP_M)
-    worst, usual = seen[int(np.argmax(away[seen]))], float(np.median(away[seen]))
+    away, most = away[seen], _OTHER_SIGMAS * known_to[seen]
     by = "from where their pixels lie by the metadata"
     wanted = "longitude first (X), then latitude (Y)" if data.frame.units[0] == "deg" else f"places in {data.frame.crs}"
-    if usual > max(most, _OTHER_SCENE_M):
+    stated = "or larger sigmas in project.toml ([trajectory], [rpc])"
+    if np.median(away / np.maximum(most, _OTHER_SCENE_M)) > 1.0:
         raise UserError(
-            f"{path}: {len(seen)} known points lie {1e-3 * usual:.0f} km (median) {by}, wanted {wanted}, and the "
-            "metadata of these scenes"
+            f"{path}: {len(seen)} known points lie {1e-3 * np.median(away):.0f} km (median) {by}, wanted {wanted}, and "
+            f"the metadata of these scenes, {stated}"
         )
-    if away[worst] > max(most, _OTHER_PLACE_M):
+    beyond = away / np.maximum(most, _OTHER_PLACE_M)
+    worst = int(np.argmax(beyond))
+    if beyond[worst] > 1.0:
         by = by.replace("their", "its")
-        raise UserError(f"{path}: point {ground.id[worst]} lies {1e-3 * away[worst]:.0f} km {by}, wanted {wanted}")
+        raise UserError(
+            f"{path}: point {ground.id[seen[worst]]} lies {1e-3 * away[worst]:.0f} km {by}, wanted {wanted}, {stated}"
+        )
+
+
+def _known_to(
+    data: SceneBlockData, image: ImageEntry, line: Array, sample: Array, height: Array
+) -> tuple[Array, Array]:
+    """Sigma (n,), m, of the places of pixels by what is known of an image beforehand, and their change by a height.
+
+    By the rays themselves: what an attitude does on the ground grows with the distance, and with the obliquity.
+    """
+    location, ellipsoid = image.location, data.ellipsoid
+    if isinstance(location, PushbroomSensor):
+        settings = data.trajectory_settings([image])
+        offset, turn = (np.asarray(settings[key], dtype=float) for key in ("offset_sigma_m", "shift_sigma_deg"))
+        J = np.linalg.norm(ground_derivatives(location, line, sample, height)[:, :2], axis=1)
+        return np.linalg.norm(J[:, :6] * [*offset, *np.radians(turn)], axis=1), J[:, 9]
+
+    def place(line: Array, sample: Array, height: Array) -> Array:
+        lat, lon, h = location.direct(line, sample, height).T
+        return ellipsoid.cartesian(lat, lon, h)
+
+    at = place(line, sample, height)
+    moved = [place(line + 1.0, sample, height) - at, place(line, sample + 1.0, height) - at]
+    up = ellipsoid.normal_and_height(at)[0]
+    by_height = np.linalg.norm(place(line, sample, height + 1.0) - at - up, axis=1)
+    shift, slope = data.rpc_sigmas_px
+    pixels = np.hypot(shift, np.sqrt(2.0) * slope)
+    return np.hypot(pixels * np.linalg.norm(moved, axis=(0, 2)), location.error_bias_m), by_height
 
 
 def _repeats(*columns: NDArray[np.generic]) -> NDArray[np.bool_]:

@@ -17,6 +17,7 @@ from satellite_scenes import Truth, write_dimap1, write_dimap2, write_isd
 
 from triline.nodes.batch.adjustment_summary import summary_lines
 from triline.nodes.cli import main
+from triline.nodes.errors import UserError
 from triline.nodes.formats.satellite.read import read_scene
 from triline.nodes.formats.satellite.rpc_files import write_rpb
 from triline.nodes.formats.scene_block import read_scene_block, write_scene_block
@@ -354,6 +355,40 @@ def test_one_swapped_control_point_of_polynomials_is_refused(made, tmp_path, cap
     capsys.readouterr()
     assert main(["adjust", str(block), "--snoop"]) == 1
     assert re.search(r"ground_points.csv: point P2 lies 79\d{2} km from where its pixels lie", capsys.readouterr().err)
+
+
+def test_known_points_are_refused_by_what_is_known_of_each_image(made, tmp_path):
+    """Polynomials of coarse pixels, or of a large shift, are off by more than 10 km; so are oblique views."""
+    block = tmp_path / "rpc"
+    block.mkdir()
+    write_rpb(block / "F.RPB", fit_to_model(read_scene(made / "spot5-hrs").sensors["F"], -500.0, 2500.0).rpc)
+    project = '[project]\ncrs = "EPSG:4979"\n[scenes.F]\nmetadata = "F.RPB"\n'
+    (block / "project.toml").write_text(project)
+    image = pd.read_csv(made / "image_points.csv")
+    image[image["ccd"] == "F"].assign(strip="F", ccd="").to_csv(block / "image_points.csv", index=False)
+    known = pd.read_csv(made / "ground_points.csv")
+    known.assign(Y_m=known["Y_m"] + 0.2).to_csv(block / "ground_points.csv", index=False)
+    with pytest.raises(UserError, match=r"known points lie 22 km \(median\) .* larger sigmas in project.toml"):
+        read_scene_block(block)
+    (block / "project.toml").write_text(project + "[rpc]\nshift_sigma_px = 1000\n")
+    read_scene_block(block)
+    (block / "project.toml").write_text(project)
+    known["sigma_Y_m"] = 8000.0  # of a small map
+    known.assign(Y_m=known["Y_m"] + 0.2).to_csv(block / "ground_points.csv", index=False)
+    read_scene_block(block)
+
+
+def test_an_attitude_counts_by_what_it_does_on_the_ground(tmp_path):
+    """70 deg off the way down a degree is 10 times as much as from above; it was taken as from 800 km above."""
+    block = tmp_path / "oblique"
+    assert main(["simulate", "-q", "-o", str(block), "--satellite", "misr", "--control", "9"]) == 0
+    known, image = pd.read_csv(block / "ground_points.csv"), pd.read_csv(block / "image_points.csv")
+    oblique = image[image["ccd"].isin(["Df", "Da"])]
+    oblique.to_csv(block / "image_points.csv", index=False)
+    known.assign(Y_m=known["Y_m"] + 0.5).to_csv(block / "ground_points.csv", index=False)
+    with open(block / "project.toml", "a") as file:
+        file.write("[trajectory]\nshift_sigma_deg = [0.5, 0.5, 0.5]\n")
+    read_scene_block(block)
 
 
 @pytest.mark.parametrize(
