@@ -99,6 +99,8 @@ class Rectifier(Node):
     def _begin_again(self) -> None:
         self._line = -1
         self._steepest: SteepestLine | None = None
+        # by CCD line, strip and time of a line whose orientation is to be looked at
+        self._awaited: dict[str, tuple[str, float]] = {}
         self._notes: list[Message] = []
         self._factor = 1
         self._next_line: dict[str, int] = {}
@@ -250,13 +252,15 @@ class Rectifier(Node):
 
     def _look_down(self, camera: LineCamera, steepest: SteepestLine, ccd: str, block: LineBlock) -> None:
         """Look at the first orientation of a lens, and show its lines from now on where they look down more steeply."""
-        measured, time_s = self.images["live"].measured, self._seconds(int(block.times_ns()[0]))
-        if not measured.covers([time_s])[0]:
-            return  # the next block of it
+        measured = self.images["live"].measured
+        here = block.strip, self._seconds(int(block.times_ns()[0]))
+        strip, time_s = self._awaited.setdefault(ccd, here)
+        if not measured.covers([time_s])[0]:  # poses may come long after the lines that they belong to
+            if time_s < measured.end_s:  # none will: it lies in a gap of them
+                self._awaited[ccd] = here
+            return
         pose = measured.at([time_s]).poses
-        tilts = steepest.see(
-            camera.line_index[ccd], block.strip, pose.position_l[0], matrix_from_angles(*pose.angles[0])
-        )
+        tilts = steepest.see(camera.line_index[ccd], strip, pose.position_l[0], matrix_from_angles(*pose.angles[0]))
         if tilts is None:
             return
         before = camera.lines[self._line].id

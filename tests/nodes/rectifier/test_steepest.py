@@ -7,6 +7,7 @@ import pytest
 
 from triline.nodes.cli import main
 from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.rectifier.rectifier import Rectifier
 from triline.nodes.rectifier.steepest import SteepestLine
 from triline.solver.camera.line_camera import Lens, LineCamera, straight_line, three_line_camera
 from triline.solver.geometry.rotation import matrix_from_angles
@@ -74,6 +75,32 @@ def test_the_live_orthoimage_of_a_triplet_is_that_of_the_lens_that_looks_down(tm
     words = ["process", str(flight), "-o", str(out), "--nodes", "rectifier", "--config", str(tmp_path / "nodes.toml")]
     assert main([*words, "-q"]) == 0
     assert tiles == [tiles_of(RecordingReader(out), version) for version in ("live", "final")]
+
+
+def test_a_lens_is_looked_at_where_poses_come_long_after_its_lines(tmp_path):
+    """A block was never looked at whose orientation came later: the orthoimage stayed that of F."""
+    flight = tmp_path / "triplet.mcap"
+    simulated = ["simulate", "-o", str(flight), "--satellite", "alos-prism-small", "--images", "--points", "34", "-q"]
+    assert main(simulated) == 0
+    messages = list(RecordingReader(flight).sorted_messages())
+    begin_ns = min(message.stamp_ns for message in messages if message.topic.startswith("sensor/lines/"))
+    poses = sorted(message.stamp_ns for message in messages if message.topic.startswith("trajectory/"))
+    assert sum(stamp > begin_ns for stamp in poses) > 10
+
+    def comes_ns(message):
+        return message.stamp_ns + 1_000_000_000 * message.topic.startswith("trajectory/")
+
+    rectifier = Rectifier()
+    wanted = tuple(name.rstrip("*") for name in rectifier.inputs)
+    said = [
+        out
+        for message in sorted(messages, key=comes_ns)
+        if message.topic.startswith(wanted)
+        for out in rectifier.step(message)
+    ]
+    said += rectifier.finish()
+    assert {out.body.ccd for out in said if out.topic == "orthoimage/final"} == {"N"}
+    assert any("CCD line N looks down more steeply than F" in out.body.message for out in said if out.topic[0] == "e")
 
 
 def tiles_of(reader, version):
