@@ -29,6 +29,8 @@ class MosaicPart(Part):
 
     def _forget(self) -> None:
         self._changed: dict[tuple[str, int, int], Any] = {}
+        self._ccd: dict[str, str] = {}  # CCD line of each orthoimage
+        self._gone: set[str] = set()  # those whose tiles so far were of another one
         self._white = 0.0
 
     def take(self, message: Message) -> None:
@@ -47,6 +49,10 @@ class MosaicPart(Part):
         if not tile.gsd_m > 0:
             raise ValueError(f"cells of {tile.gsd_m} m")
         self.state.has_mosaic = True
+        if self._ccd.setdefault(version, tile.ccd) != tile.ccd:
+            self._ccd[version] = tile.ccd
+            self._gone.add(version)
+            self._changed = {key: old for key, old in self._changed.items() if key[0] != version}
         self._changed[version, tile.row, tile.column] = tile
 
     def _shown(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -67,6 +73,9 @@ class MosaicPart(Part):
     def draw(self, canvas: Canvas) -> None:
         if self.state.newest is None:  # the display frame is not known yet
             return
+        for version in self._gone:
+            canvas.clear(f"mosaic/{version}")
+        self._gone.clear()
         for (version, row, column), tile in self._changed.items():
             grey = np.frombuffer(tile.data, dtype=np.uint8).reshape(tile.size, tile.size)
             rows, columns = np.flatnonzero(grey.any(axis=1)), np.flatnonzero(grey.any(axis=0))

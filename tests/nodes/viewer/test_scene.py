@@ -17,12 +17,13 @@ from triline.nodes.cli.view import show
 from triline.nodes.convert import PoseSample
 from triline.nodes.node import Message
 from triline.nodes.viewer.incoming_lines import LinesPart
+from triline.nodes.viewer.orthoimages import MosaicPart
 from triline.nodes.viewer.rerun_canvas import _ASPECT, _FIELD_OF_VIEW, _overview, viewpoint
 from triline.nodes.viewer.scene_part import CHECK, CONTROL, FINAL, LIVE, REJECTED, Pieces
 from triline.nodes.viewer.scene_state import PoseHistory, SceneState, round_number
 from triline.nodes.viewer.trajectories import FlightPart, ellipsoid
 from triline.schemas.image_lines import LineBlock
-from triline.schemas.messages import ImagePoint, TiePoint
+from triline.schemas.messages import GroundTile, ImagePoint, TiePoint
 from triline.solver.camera.sensors import preset
 from triline.solver.geometry.rotation import matrix_from_quaternion
 
@@ -518,3 +519,27 @@ def test_in_another_local_frame_nothing_of_the_one_before_stays_drawn(messages):
     lat = [layout.geographic_centre[0] for layout in (before.layouts[-1], canvas.layouts[-1])]
     assert lat[1] - lat[0] == pytest.approx(0.1, abs=0.02)
     assert len(canvas.pieces("map/final")) > len(before.pieces("map/final"))  # where it was flown
+
+
+def test_tiles_of_another_ccd_line_take_the_place_of_all_before():
+    """Tiles of the lens that looks forward stayed beside those of the one that looks down."""
+    state, canvas = SceneState(), Notebook()
+    state.newest = PoseSample(START_NS, np.array([0.0, 0.0, 1500.0]), np.array([0.0, 0.0, 0.0, 1.0]), None, True)
+    part = MosaicPart(state)
+
+    def tile(version, ccd, column):
+        grey = bytes([100]) * 16
+        body = GroundTile(column=column, size=4, gsd_m=1.0, x=4.0 * column, encoding="mono8", data=grey, ccd=ccd)
+        part.take(Message(f"orthoimage/{version}", START_NS, body))
+
+    for version, ccd, column in (("live", "F", 0), ("final", "F", 0), ("live", "F", 1)):
+        tile(version, ccd, column)
+    part.draw(canvas)
+    tile("live", "F", 2)
+    tile("live", "N", 3)
+    part.draw(canvas)
+    assert set(canvas.drawn) == {"mosaic/live/0_3", "mosaic/final/0_0"}
+    tile("final", "N", 1)
+    tile("live", "N", 4)
+    part.draw(canvas)
+    assert set(canvas.drawn) == {"mosaic/live/0_3", "mosaic/live/0_4", "mosaic/final/0_1"}
