@@ -307,7 +307,7 @@ class Fly(LiveFlight):
         if not any(row.received for row in rows):
             raise UserError(f"no sensor data came in on triline/{self.platform}; never seen: {', '.join(missing)}")
         result = super()._evaluate()
-        refused = refused_inputs(self._overview.nodes, self.estimators)
+        refused = refused_inputs(self._overview.nodes, self.estimators, self._overview.earlier)
         sensors = {row.name: row.received for row in rows}
         return {**result, "sensors": sensors, "never_seen": missing, "refused": refused}
 

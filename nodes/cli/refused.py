@@ -2,25 +2,40 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any
+
+from ..monitor.monitor import TopicSums, topic_sums
 
 #: What a node is given for one purpose: of each, one message that is of use is enough.
 PURPOSES = (("sensor/gnss",), ("sensor/imu", "sensor/attitude"), ("sensor/lines/",), ("observation/tie",))
 
 
-def refused_inputs(statuses: Mapping[str, Any], nodes: Iterable[str]) -> list[str]:
-    """A line for each input of nodes of which they refused every message; none of what did not come."""
+def refused_inputs(
+    statuses: Mapping[str, Any], nodes: Iterable[str], earlier: Mapping[str, TopicSums] | None = None
+) -> list[str]:
+    """A line for each input of nodes of which they refused every message; none of what did not come.
+
+    Parameters
+    ----------
+    statuses : the newest of each node
+    earlier : what became of messages before a node was started again
+    """
     told = []
     for name in nodes:
         status = statuses.get(name)
         if status is None:
             continue
+        sums = topic_sums(status) + (earlier or {}).get(name, Counter())
         for topics in PURPOSES:
-            rows = [row for row in status.topics if row.topic.startswith(topics)]
-            received, refused = (sum(getattr(row, what) for row in rows) for what in ("received", "refused"))
-            if received and refused + sum(row.duplicates for row in rows) >= received and refused:
-                came = sorted(row.topic for row in rows if row.received)
+            own = {key: number for key, number in sums.items() if key[0].startswith(topics)}
+            received, refused, twice = (
+                sum(number for (_, kind), number in own.items() if kind == what)
+                for what in ("received", "refused", "duplicates")
+            )
+            if received and refused + twice >= received and refused:
+                came = sorted(topic for topic, kind in own if kind == "received")
                 what = f"{topics[0]}*" if len(came) > 1 and len(topics) == 1 else " and ".join(came)
                 told.append(f"{name} used none of the {received} messages on {what}{_why(status, topics)}")
     return told

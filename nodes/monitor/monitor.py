@@ -35,6 +35,15 @@ WATCHED = ("navigator", "matcher", "adjuster", "rectifier", "recorder")
 #: Said while nodes are stopped along the flow of data.
 ENDING = "ending: nodes finish what they have"
 
+#: Messages by topic and by what became of them.
+TopicSums = Counter[tuple[str, str]]
+
+
+def topic_sums(status: Any) -> TopicSums:
+    """Of a node how many messages it was given, could not use, and was given twice."""
+    kinds = ("received", "refused", "duplicates")
+    return Counter({(row.topic, kind): getattr(row, kind) for row in status.topics for kind in kinds})
+
 
 @dataclass
 class Overview:
@@ -47,6 +56,7 @@ class Overview:
     rejected: int = 0
     final_until_ns: int = 0
     events: deque[tuple[int, str, str]] = field(default_factory=lambda: deque(maxlen=5))  # stamp, level, text
+    earlier: dict[str, TopicSums] = field(default_factory=dict)  # of nodes before they were started again
     said: Counter[str] = field(default_factory=Counter)  # how often each node has told its status
     said_then: dict[str, Counter[str]] = field(default_factory=dict)  # the same when a node told its own last
     ending: bool = False  # nodes are being stopped on purpose: that they fall silent is no alarm
@@ -78,6 +88,9 @@ class Overview:
 
     def take_status(self, name: str, status: Any) -> None:
         """The newest status of a node."""
+        before = self.nodes.get(name)
+        if before is not None and status.uptime_s < before.uptime_s:
+            self.earlier[name] = self.earlier.get(name, Counter()) + topic_sums(before)
         self.nodes[name] = status
         self.said[name] += 1
         self.said_then[name] = self.said.copy()

@@ -8,6 +8,7 @@ from places import ROOT
 from triline.nodes.adjuster.adjuster import Adjuster
 from triline.nodes.cli.live_flight import ESTIMATORS
 from triline.nodes.cli.refused import refused_inputs
+from triline.nodes.monitor.monitor import Overview
 from triline.nodes.navigator.navigator import Navigator
 from triline.nodes.recording.reader import RecordingReader
 from triline.nodes.step_driver import StepDriver
@@ -60,6 +61,19 @@ def test_inertial_data_or_attitude_is_enough():
     assert told(matcher({"sensor/imu": (10, 10), "sensor/attitude": (0, 5)})) == []
     (line,) = told(matcher({"sensor/imu": (10, 10), "sensor/attitude": (5, 5)}))
     assert line.startswith("matcher used none of the 15 messages on sensor/attitude and sensor/imu: ")
+
+
+@pytest.mark.parametrize("used", [0, 1])
+def test_a_node_that_was_started_again_is_judged_by_the_whole_flight(used):
+    """One that died at the end of a good flight, and then got nothing of use, made of it a flight that failed."""
+    overview = Overview()
+    runs = [(10.0, 300, 300), (3600.0, 9000, 9000 + used), (0.1, 0, 0), (8.0, 5, 5)]
+    for uptime_s, of, all_ in runs:
+        status = matcher({"sensor/lines/N": (of, all_)})
+        status.uptime_s = uptime_s
+        overview.take_status("matcher", status)
+    lines = refused_inputs(overview.nodes, ESTIMATORS, overview.earlier)
+    assert lines == ([] if used else [f"matcher used none of the 9005 messages on sensor/lines/N: malformed: {WHY}"])
 
 
 def over_a_strip(node, change):
