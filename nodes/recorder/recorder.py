@@ -396,8 +396,7 @@ class Recorder(Node):
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._open()
         except OSError as error:
-            text = f"{why}{self._path}: {(error.strerror or str(error)).lower()}"
-            self.last_problem = self.last_problems["disk"] = text
+            self.keep_problem("disk", f"{why}{self._path}: {(error.strerror or str(error)).lower()}")
         else:
             self.problem("resumed", f"{why}recording again, into {self.files[-1]}; {self._lost} messages lost")
 
