@@ -10,6 +10,8 @@ from ..monitor.monitor import TopicSums, topic_sums
 
 #: What a node is given for one purpose: of each, one message that is of use is enough.
 PURPOSES = (("sensor/gnss",), ("sensor/imu", "sensor/attitude"), ("sensor/lines/",), ("observation/tie",))
+#: Counters of messages that are used, or were before.
+NOT_REFUSED = ("late", "duplicate")
 
 
 def refused_inputs(
@@ -43,7 +45,8 @@ def refused_inputs(
 
 def _why(status: Any, topics: tuple[str, ...]) -> str:
     """The last problem of what was refused most often of these topics, else the last one that the node had."""
-    named = [c for c in status.counters if any(topic in c.last_problem for topic in topics)]
+    refusing = (counter for counter in status.counters if counter.name not in NOT_REFUSED)
+    named = [c for c in refusing if any(topic in c.last_problem for topic in topics)]
     if not named:
         return f": {status.last_problem}" if status.last_problem else ""
     most = max(named, key=lambda counter: counter.value)

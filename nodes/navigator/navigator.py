@@ -207,7 +207,7 @@ class Navigator(Node):
     def _wrong_clock(self, words: str, remedy: str = "") -> None:
         text = f"{words}: GNSS is left out{'; ' if remedy else ''}{remedy}"
         self.alarms["clock"] = text
-        self.problem("clock", text)
+        self.problem("clock", f"sensor/gnss: {text}")
         self._notes.append(self._log(self._stamp_ns, text, warning=True))
 
     def _renumbered(self, number: int, time_ns: int) -> bool:

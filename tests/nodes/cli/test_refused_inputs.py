@@ -108,8 +108,14 @@ def test_ties_on_an_unknown_strip_are_refused_by_the_adjuster(change, number):
     )
 
 
-@pytest.mark.parametrize("change", ["covariance", "clock"])
-def test_fixes_that_cannot_be_used_are_refused_by_the_navigator(change):
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ("covariance", "malformed: sensor/gnss: position covariance"),
+        ("clock", "clock: sensor/gnss: GNSS clock 18.00 s ahead of"),
+    ],
+)
+def test_fixes_that_cannot_be_used_are_refused_by_the_navigator(change, why):
     navigator = Navigator()
 
     def spoil(message):
@@ -123,3 +129,11 @@ def test_fixes_that_cannot_be_used_are_refused_by_the_navigator(change):
 
     fixes = over_a_strip(navigator, spoil)
     assert fixes > 100 and navigator.refusals >= fixes - 3
+    # of another clock they come late, too, which is not why they are not used
+    status = m.NodeStatus(node="navigator", last_problem="sensor/gnss 7 came 1.2 s behind")
+    status.topics.add(topic="sensor/gnss", received=fixes, refused=fixes)
+    navigator.counters["late"], navigator.last_problems["late"] = 10 * fixes, status.last_problem
+    for name, value in navigator.counters.items():
+        status.counters.add(name=name, value=value, last_problem=navigator.last_problems.get(name, ""))
+    (line,) = told(status)
+    assert line.startswith(f"navigator used none of the {fixes} messages on sensor/gnss: {why}")
