@@ -45,7 +45,8 @@ class Node:
 
     ``inputs`` and ``outputs`` name topics of the topic table. `step` takes one message and returns what follows
     from it; `finish` is called once, when no more messages come, and returns what was still held back. Bad data never
-    raises: it is counted with `problem`, dropped, and shown on ``status/<node>``.
+    raises: it is counted with `problem`, or with `refuse` where nothing of a message can be used, dropped, and shown on
+    ``status/<node>``.
     """
 
     name: ClassVar[str]
