@@ -11,12 +11,12 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...schemas import codec, topics
 from ...schemas import messages as m
-from ...schemas import topics
 from ...schemas.envelope import RawMessage
 
 #: The name under which a recorder's inventory travels.
@@ -34,6 +34,8 @@ BURST_S = 0.25
 PATIENCE_S = 3.0
 #: A tile of an orthoimage comes with so many cells a side.
 THUMBNAIL = 32
+#: A status of more bytes comes with so many characters of each of its problems at most.
+STATUS_BYTES, STATUS_TEXT = 1000, 200
 #: Bytes of messages in one answer of a gap, about: an answer that the link cuts is asked for again as a whole.
 PORTION_BYTES = 60_000
 #: Runs of numbers and messages in one question, at most.
@@ -125,12 +127,17 @@ def asked(parameters: dict[str, str]) -> Asked:
 
 
 def for_the_link(raw: RawMessage) -> RawMessage:
-    """A message as it comes down: tiles of orthoimages smaller, all others as they are.
+    """A message as it comes down: tiles of orthoimages smaller, problems of a status in short, all others as they are.
 
     Raises
     ------
-    ValueError : a tile that is none
+    ValueError : a tile or a status that is none
     """
+    if raw.topic.startswith("status/") and len(raw.data) > STATUS_BYTES:
+        status: Any = codec.decode(raw.topic, raw.data)
+        for told in (status, *status.counters):
+            told.last_problem = told.last_problem[:STATUS_TEXT]
+        return raw._replace(data=codec.encode(status))
     if not raw.topic.startswith("orthoimage/"):
         return raw
     tile = m.GroundTile.FromString(bytes(raw.data))

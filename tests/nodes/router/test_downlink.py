@@ -130,6 +130,21 @@ def test_tiles_come_down_small_with_the_means_of_what_is_known():
         for_the_link(raw("orthoimage/live", 1, codec.encode(m.GroundTile(size=9, encoding="mono8", data=b"1"))))
 
 
+def test_problems_of_a_status_come_down_in_short():
+    """Each counter tells its last problem, of up to 5000 characters: some would take a thin link for seconds."""
+    status = m.NodeStatus(node="matcher", state="running", last_problem="7" * 5000)
+    for name in ("late", "malformed", "second voice"):
+        status.counters.add(name=name, value=3, last_problem=name + ": " + "9" * 5000)
+    small = for_the_link(raw("status/matcher", 4, codec.encode(status)))
+    body = codec.decode("status/matcher", small.data)
+    assert cost(small) < 1500 and [c.value for c in body.counters] == [3, 3, 3]
+    assert [c.last_problem[: len(c.name)] for c in body.counters] == ["late", "malformed", "second voice"]
+    usual = raw("status/matcher", 8, codec.encode(m.NodeStatus(node="matcher", last_problem="sensor/gnss 7: empty")))
+    assert for_the_link(usual) is usual
+    with pytest.raises(ValueError):
+        for_the_link(raw("status/matcher", 12, b"\xff" * 2000))
+
+
 def test_questions_that_make_no_sense_are_refused():
     good = {"topic": "event/log", "source": "s", "start": "5", "runs": "1-4,9-9", "every": "1"}
     assert asked(good).runs == [(1, 4), (9, 9)]
