@@ -105,7 +105,8 @@ UNITS: dict[str, dict[str, str | tuple[str, ...]]] = {
     "triline.ObjectPoint": {**_POINT, "rays": ""},
     "triline.Counter": {"value": ""},
     "triline.TopicStatistics": {
-        **dict.fromkeys(("received", "gaps", "duplicates", "late", "malformed", "dropped"), ""), "rate_hz": "hz",
+        **dict.fromkeys(("received", "refused", "gaps", "duplicates", "late", "malformed", "dropped"), ""),
+        "rate_hz": "hz",
     },
     "triline.NodeStatus": {"uptime_s": "s", "lag_s": "s", "queued": ""},
     "triline.GroundTile": {
