@@ -458,6 +458,12 @@ BENCHMARKS = (
         105,
     ),
     Benchmark(
+        "busy-tests",
+        "Do all tests pass, run after run, beside a loop that keeps a core busy?",
+        ("python bench/busy_tests.py --runs 20",),
+        200,
+    ),
+    Benchmark(
         "fuzz",
         "Do readers and nodes stand hostile files and messages whose checksums are right?",
         ("python bench/fuzz.py --cases 1000000 --seconds 5400",),
