@@ -95,6 +95,13 @@ def time_ns(timestamp: Any) -> int:
     return timestamp.seconds * SECOND_NS + timestamp.nanos
 
 
+def log_line(node: str, text: str, time_ns: int, warning: bool = False) -> Any:
+    """A line for the operator, for ``event/log``, of a node and a time."""
+    body = m.Log(name=node, message=text, level=m.Log.Level.Value("WARNING" if warning else "INFO"))
+    set_time(body.timestamp, time_ns)
+    return body
+
+
 def set_time(timestamp: Any, time_ns: int) -> None:
     """Set a protobuf Timestamp field in place."""
     timestamp.seconds, timestamp.nanos = divmod(int(time_ns), SECOND_NS)

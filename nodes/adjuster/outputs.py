@@ -246,9 +246,7 @@ def _refusal(r: Refusal) -> Any:
 
 def log(node: str, text: str, stamp_ns: int, warning: bool = False) -> Message:
     """A line for the operator."""
-    body = m.Log(name=node, message=text, level=m.Log.Level.Value("WARNING" if warning else "INFO"))
-    convert.set_time(body.timestamp, stamp_ns)
-    return Message("event/log", stamp_ns, body)
+    return Message("event/log", stamp_ns, convert.log_line(node, text, stamp_ns, warning))
 
 
 def _number(value: float) -> float:

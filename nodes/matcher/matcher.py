@@ -468,6 +468,4 @@ class Matcher(Node):
         return self._stamp_ns + self._delay_ns
 
     def _log(self, text: str, warning: bool = False) -> Message:
-        body = m.Log(name=self.name, message=text, level=3 if warning else 2)
-        convert.set_time(body.timestamp, self._stamp_ns)
-        return Message("event/log", self._stamp_ns, body)
+        return Message("event/log", self._stamp_ns, convert.log_line(self.name, text, self._stamp_ns, warning))

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from ...schemas import messages as m
 from ...solver.geometry.frames import LocalFrame
 from ...solver.geometry.rotation import R_ENU_NED
 from ...solver.navigation.clock_check import LARGEST_DELAY_S, ClockCheck, offset_in_words
@@ -397,6 +396,4 @@ class Navigator(Node):
         return out
 
     def _log(self, time_ns: int, text: str, warning: bool = False) -> Message:
-        body = m.Log(name=self.name, message=text, level=3 if warning else 2)
-        convert.set_time(body.timestamp, time_ns)
-        return Message("event/log", self._stamp_ns, body)
+        return Message("event/log", self._stamp_ns, convert.log_line(self.name, text, time_ns, warning))

@@ -276,8 +276,7 @@ class Rectifier(Node):
                 f"CCD line {ccd} looks down more steeply than {before} ({now:.1f} and {was:.1f} deg off): "
                 "the orthoimage shows it from now on"
             )
-            body = m.Log(name=self.name, message=text, level=m.Log.INFO)
-            convert.set_time(body.timestamp, self._stamp_ns)
+            body = convert.log_line(self.name, text, self._stamp_ns)
             self._notes.append(Message("event/log", self._stamp_ns, body))
 
     def _reduced(self, lines: WaitingLines) -> None:

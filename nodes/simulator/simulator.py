@@ -299,9 +299,7 @@ class Simulator(Node):
         text = world_text(self.simulation.world)
 
         def body(i: int, epoch_ns: int) -> object:
-            message = m.Log(name=self.name, message=text, level=m.Log.Level.Value("INFO"))
-            convert.set_time(message.timestamp, epoch_ns + BEFORE_NS)
-            return message
+            return convert.log_line(self.name, text, epoch_ns + BEFORE_NS)
 
         return _Stream("truth/world", np.full(1, BEFORE_NS), body)
 

@@ -423,10 +423,8 @@ class Window:
         strip = self.strip_at(self._newest_ray_s) if fresh else None
         if strip is None or not self.trajectory.covers([self._newest_ray_s])[0]:
             return
-        turn, stated = (
-            self._orientation.turn(strip, self._newest_ray_s),
-            float(np.linalg.norm(strip.slow.attitude_sigma)),
-        )
+        stated = float(np.linalg.norm(strip.slow.attitude_sigma))
+        turn = self._orientation.turn(strip, self._newest_ray_s)
         if turn > MOST_TURNED + STATED_COUNTS * stated:
             raise DivergedError(f"the solution turns the measured attitude by {np.degrees(turn):.0f} deg")
 
