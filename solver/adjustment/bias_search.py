@@ -36,7 +36,8 @@ class Verdict:
     ----------
     chosen : the best hypothesis: places of coordinates, and c + axis for a shift of all in an axis
     out : (c,) coordinates not to be used: those of the best hypothesis, and of all others that are nearly as good;
-        without those of a shift that all have in common where that is one of the trajectory
+        without those of a shift that all have in common where that is one of the trajectory, and without those that
+        say nothing any more once the others are out: of a point of one look, which is two conditions, the third stays
     rivals : (k, c) the coordinates of the hypotheses between which it cannot be told, the best one first; k is 1 where
         there is no other
     score : of the best hypothesis, 0 if nothing is wrong; the lower, the better
@@ -90,7 +91,24 @@ def judge(
         if (other & ~mine).any() and (mine & ~other).any() and not any((other | r == other).all() for r in rivals[1:]):
             rivals.append(other)  # and not one of them with more to it
             out |= other
-    return Verdict(best, out, tuple(rivals), scores[best])
+    return Verdict(best, _telling(C, out), tuple(rivals), scores[best])
+
+
+def _telling(C: Array, out: Bools) -> Bools:
+    """Those of the coordinates that are out (c,) of which something is known when the ones before them are out.
+
+    The others say nothing anyway. But with all coordinates of a point of one look out it would have no place, and could
+    never be judged again.
+    """
+    out, own = out.copy(), np.flatnonzero(out)
+    left = C[np.ix_(own, own)]
+    whole = np.diagonal(left).copy()
+    for k, place in enumerate(own.tolist()):
+        if left[k, k] <= UNTOLD * whole[k]:
+            out[place] = False
+        else:
+            left = left - np.outer(left[:, k], left[k]) / left[k, k]
+    return out
 
 
 def _search(M: Array, m: Array, usable: IntArray, price: float) -> dict[frozenset[int], float]:

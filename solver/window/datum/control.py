@@ -300,7 +300,7 @@ class ControlTests:
             n = int(mine.sum())
             common = len(d.v) + a in verdict.chosen
             alone = self._of_gnss and n == 1 and bool(verdict.out[mine].all())
-            if not n or not (common or alone) or (self._of_gnss and not verdict.out[mine].all()):
+            if not n or not (common or alone):
                 continue
             U = np.column_stack([mine, np.eye(len(mine))[:, verdict.out & ~mine]])
             every = np.ones(U.shape[1], dtype=bool)

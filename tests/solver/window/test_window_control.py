@@ -11,6 +11,7 @@ from triline.solver.adjustment.bias_search import UNTOLD, _search, judge
 from triline.solver.adjustment.reliability import CRITICAL_W
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
+from triline.solver.simulation.misspecified_study import ROWS, SETTINGS
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import adjust_online, navigate, orientation_errors
 from triline.solver.window.datum.biases import Biases, Coordinate, LeftControl, discrepancies
@@ -169,6 +170,21 @@ def test_good_control_is_rarely_refused():
     assert 0 < refused < 2000 * 8 * 1.5e-3  # seven tests of 0.1 % each, not all of them independent
 
 
+def test_a_point_of_one_look_keeps_a_coordinate_and_comes_back():
+    """A look is two conditions: two of the three coordinates out are all that it can contradict. With all three out the
+    point would have no place, and could not be judged again."""
+    look = np.array([[1.0, 0.0, -0.6], [0.0, 1.0, 0.2]])
+    axis, nothing = np.arange(3), np.zeros(3, dtype=bool)
+    for orientation_m, out in ((0.05, [0, 1]), (2.0, [])):  # as stated; and when that is known to be worse
+        inner = np.linalg.inv((0.1**2 + orientation_m**2) * np.eye(2) + 0.02**2 * look @ look.T)
+        C, v = look.T @ inner @ look, look.T @ inner @ np.array([1.3, 1.1])
+        found = judge(C, v, axis, PRICE, nothing, ())
+        assert np.flatnonzero(found.out).tolist() == out
+        if out:
+            assert len(found.rivals) > 1 and np.any(found.rivals, axis=0).all()  # any two of them
+            assert (judge(C, v, axis, PRICE, found.out, ()).out == found.out).all()
+
+
 # ---- flights
 
 PLAN = FlightPlan(strip_s=60.0, lead_in_s=3.0, lead_out_s=2.0)
@@ -251,6 +267,21 @@ def test_one_wrong_coordinate_is_named_and_good_control_is_not(flight):
     assert not [r for r in right.refused if r.coordinate]
     whole = [orientation_errors(flight[0], r.whole).rmse[2] for r in (online, right)]
     assert whole[0] < 1.3 * whole[1] + 0.02
+
+
+def test_control_of_one_look_counts_again_when_the_trajectory_is_known_to_be_worse():
+    plan, ties = FlightPlan(strip_s=40.0, lead_in_s=3.0, lead_out_s=2.0), ObservationPlan(4.0, control=4)
+    flown = simulate(plan, 2, SETTINGS["rtk"], ties, world=ROWS["boresight"].world)
+    point = flown.images.looks.point
+    later = np.append(False, point[1:] == point[:-1]) & (flown.points.role[point] == "control")
+    flown = replace(flown, images=flown.images.select(~later))
+    online = adjust_online(flown, navigate(flown), WindowOptions(grid_hz=4.0), update_s=1.0)
+    contradicting, back = (
+        [(r.point, r.coordinate) for r in online.refused if r.coordinate and r.reason == reason]
+        for reason in (CONTRADICTS, TAKEN_BACK)
+    )
+    assert contradicting and sorted(back) == sorted(contradicting)
+    assert len({axis for _, axis in contradicting}) == 2
 
 
 @pytest.mark.study
