@@ -159,12 +159,13 @@ class PoseBuffer:
         return _matrix(covariance) if newest_s >= time_s else None
 
     @property
-    def learning(self) -> bool:
-        """Whether the newest smoothed pose is clearly more certain than the newest filtered one."""
+    def learning(self) -> tuple[bool, bool]:
+        """Whether position, and attitude, of the newest smoothed pose are clearly more certain than when filtered."""
         if len(self._latest) < 2:
-            return False
+            return False, False
         smoothed, filtered = (np.array(self._latest[key][1][::7]) for key in (True, False))
-        return bool((smoothed < (1.0 - LEARNT_SHARE) * filtered).any())
+        learnt = smoothed < (1.0 - LEARNT_SHARE) * filtered
+        return bool(learnt[:3].any()), bool(learnt[3:].any())
 
     @property
     def leading(self) -> tuple[float, Array] | None:
