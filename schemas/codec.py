@@ -31,6 +31,10 @@ _SIZES: dict[str, dict[str, int]] = {
 }  # fmt: skip
 
 
+class ImpossibleValues(ValueError):
+    """A message that came as it was sent, with values that no publisher may send."""
+
+
 def encode(body: Any) -> bytes:
     """The payload of a message body (a protobuf message or a `LineBlock`); the same body gives the same bytes."""
     if isinstance(body, LineBlock):
@@ -43,7 +47,8 @@ def decode(topic: str, data: bytes | memoryview) -> Any:
 
     Raises
     ------
-    ValueError : it cannot be decoded, or holds values no publisher may send (not finite, of the wrong size)
+    ImpossibleValues : it holds values no publisher may send (not finite, of the wrong size)
+    ValueError : it cannot be decoded
     KeyError : the topic is not in the topic table
     """
     if not len(data) and topics.find(topic).family in (topics.Family.CONFIGURATION, topics.Family.SENSOR):
@@ -115,19 +120,19 @@ def _getter(names: list[str]) -> Callable[[Any], Iterable[float]]:
 
 
 def validate(body: Any) -> None:
-    """Raise ValueError for a message with values that are not finite, or with the wrong number of values."""
+    """Raise ImpossibleValues for a message with values that are not finite, or with the wrong number of values."""
     if not _is_fine(body):
         _find_fault(body)
     of_type = type(body)
     if of_type is m.LocationFix and not abs(body.latitude) <= 90:
-        raise ValueError(f"latitude {body.latitude}, wanted -90 to 90 degrees")
+        raise ImpossibleValues(f"latitude {body.latitude}, wanted -90 to 90 degrees")
     if of_type is m.Camera and not (body.lenses and body.lines):
-        raise ValueError(f"camera {body.name!r} with {len(body.lenses)} lenses and {len(body.lines)} CCD lines")
+        raise ImpossibleValues(f"camera {body.name!r} with {len(body.lenses)} lenses and {len(body.lines)} CCD lines")
     if of_type is m.PoseInFrame:
         q = body.pose.orientation
         norm = math.hypot(q.x, q.y, q.z, q.w)
         if abs(norm - 1) > 1e-3:
-            raise ValueError(f"quaternion of length {norm:.3g}, wanted 1")
+            raise ImpossibleValues(f"quaternion of length {norm:.3g}, wanted 1")
 
 
 def _is_fine(body: Any) -> bool:
@@ -151,17 +156,17 @@ def _is_fine(body: Any) -> bool:
 
 
 def _find_fault(body: Any) -> None:
-    """Raise ValueError for the first field that is at fault, if one is."""
+    """Raise ImpossibleValues for the first field that is at fault, if one is."""
     sizes = _SIZES.get(body.DESCRIPTOR.full_name, {})
     for field, value in body.ListFields():  # only fields that are set: a default is always finite
         size = sizes.get(field.name)
         if size is not None and len(value) != size:
-            raise ValueError(f"{field.name} has {len(value)} values, wanted {size}")
+            raise ImpossibleValues(f"{field.name} has {len(value)} values, wanted {size}")
         kind = field.cpp_type
         if kind in (field.CPPTYPE_DOUBLE, field.CPPTYPE_FLOAT):
             finite = math.isfinite(value) if isinstance(value, float) else np.isfinite(np.asarray(value)).all()
             if not finite:
-                raise ValueError(f"{field.name} is not finite")
+                raise ImpossibleValues(f"{field.name} is not finite")
         elif kind == field.CPPTYPE_MESSAGE:
             for part in (value,) if hasattr(value, "ListFields") else value:
                 _find_fault(part)

@@ -62,7 +62,7 @@ from ..formats.new_file import new_file, new_files, refuse_unless_folder
 from ..formats.scene_block import is_scene_block
 from ..recording.reader import RecordingReader
 from ..recording.remote import path_of
-from ..recording.summary import damage_lines
+from ..recording.summary import OF_RECORDING, damage_lines, in_brackets, left_out_lines, unfit_lines
 from ..terminal import drawing, plain, redraws, width
 from ..voices import RecordedVoices
 from .adjust_scenes import run_scenes
@@ -302,10 +302,9 @@ def read_input(path: Path) -> BlockData:
         with navigated(reader, path.name, notes) as oriented:
             block = block_from_messages(voices.all_used(oriented.sorted_messages(TOPICS)), path.name)
     except UserError as error:
-        lines = damage_lines(reader)
-        raise UserError(f"{error} ({'; '.join(lines)})") if lines else error from None
-    damage = (f"damaged recording: {line}" for line in damage_lines(reader))
-    return replace(block, notes=(*damage, *notes, *voices.lines(), *block.notes))
+        raise UserError(f"{error}{in_brackets(left_out_lines(reader))}") from None
+    damage = (f"{OF_RECORDING}{line}" for line in damage_lines(reader))
+    return replace(block, notes=(*damage, *unfit_lines(reader), *notes, *voices.lines(), *block.notes))
 
 
 def refuse_worker_options(args: argparse.Namespace) -> None:

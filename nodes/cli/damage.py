@@ -6,12 +6,12 @@ import sys
 
 from ..convert import iso
 from ..recording.reader import RecordingReader
-from ..recording.summary import damage_lines
+from ..recording.summary import left_out_lines
 
 
 def tell_damage(command: str, reader: RecordingReader) -> None:
-    """Print one line on standard error if damage makes the result incomplete, also with --quiet."""
-    lines = damage_lines(reader)
+    """Print one line on standard error if what is left out makes the result incomplete, also with --quiet."""
+    lines = left_out_lines(reader)
     if lines:
         print(f"triline {command}: {reader.path}: {'; '.join(lines)}", file=sys.stderr)
 

@@ -47,7 +47,7 @@ from ..formats.smrmsg import write_smrmsg_poses
 from ..node import Message
 from ..recording.access import Recording
 from ..recording.reader import RecordingReader
-from ..recording.summary import damage_lines, held_topics, lacking
+from ..recording.summary import damage_lines, held_topics, lacking, unfit_lines
 from .damage import tell_damage, tell_other_frame
 from .outputs import refuse_input_as_output
 
@@ -145,7 +145,7 @@ def run(args: argparse.Namespace) -> int:
     result = {
         "recording": str(path), "topic": args.topic, "type": row.type_name, "file": str(target), **count,
         **({"beside": beside} if beside else {}), "skipped": skipped, "damaged_stretches": len(reader.damage),
-        "damage": damage_lines(reader),
+        "damage": damage_lines(reader), "not_used": unfit_lines(reader),
     }  # fmt: skip
     if kind not in _TABLES and _is_local(args.topic):
         tell_other_frame("export", reader)
@@ -187,7 +187,7 @@ def _run_table(path: Path, args: argparse.Namespace) -> int:
         result |= _write_camera(recording, name, target)
     tell_other_frame("export", reader)
     if args.json:
-        print(json_text(result | {"damage": damage_lines(reader)}))
+        print(json_text(result | {"damage": damage_lines(reader), "not_used": unfit_lines(reader)}))
         return 0
     if not args.quiet:
         print(f"{path} -> {target}: {said}")
@@ -366,8 +366,7 @@ def _valid_poses(
         try:
             samples.append(pose_sample(message.body))
         except ValueError as error:
-            reader.problems["malformed"] += 1
-            reader.last_problem = str(error)
+            reader.note_problem("malformed", str(error))
     lost = sum(not sample.valid for sample in samples)  # neither format has a flag
     samples = [sample for sample in samples if sample.valid]
     if len(samples) < 2:

@@ -119,7 +119,7 @@ def _lines(s: dict[str, Any]) -> list[str]:
     if "signed" in s:
         lines.append(f"{s['signed']['words']}{'' if s['signed']['altered'] else ', nothing was altered'}")
         lines += [f"altered: {text}" for text in s["signed"]["altered"]]
-    lines += [f"damaged: {text}" for text in s["damage"]]
+    lines += [f"not as it should be: {text}" for text in s["damage"]]
     return lines
 
 

@@ -332,11 +332,12 @@ class LiveFlight:
 
     def summary(self, result: dict[str, Any]) -> str:
         """The lines that are printed at the end."""
+        from ..recording.summary import OF_RECORDING
         from ..report.accuracy_table import accuracy_lines
 
         lines = ["", *(accuracy_lines(result) if "report" in result else [])]
         lines += [f"missing: {text}" for text in result.get("missing", [])]
-        lines += [f"damaged recording: {text}" for text in result.get("damage", [])]
+        lines += [f"{OF_RECORDING}{text}" for text in result.get("damage", [])]
         lines += result.get("not_used", [])
         lines += [f"no report: {result['no_report']}"] if "no_report" in result else []
         lines += self.remarks(result)

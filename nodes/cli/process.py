@@ -25,7 +25,7 @@ from ..node import Node
 from ..recording.reader import RecordingReader
 from ..recording.remote import path_of
 from ..recording.runner import ProcessSummary, process
-from ..recording.summary import damage_lines, held_topics, lacking
+from ..recording.summary import damage_lines, held_topics, lacking, not_whole
 from ..recording.writer import COMPRESSIONS, RecordingWriter
 from .damage import tell_damage
 from .dem_options import add_dem_options, dem_settings
@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--processes", type=int, choices=(1, 2), default=2,
         help="of this machine at most; the output is the same (default: 2, where there are two processors)",
     )  # fmt: skip
-    parser.add_argument("--strict", action="store_true", help="refuse a recording that is damaged")
+    parser.add_argument("--strict", action="store_true", help="refuse a recording that is not whole")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -175,8 +175,7 @@ def _check(reader: RecordingReader, args: argparse.Namespace) -> None:
     if not any(channel.known for channel in reader.channels.values()):
         raise UserError(f"{args.recording}: no topic of triline in it")
     if args.strict and (reader.damage or not reader.complete):
-        what = str(reader.damage[0]) if reader.damage else "the file has no end"
-        raise UserError(f"{args.recording}: damaged: {what}")
+        raise UserError(f"{args.recording}: not whole: {not_whole(reader)[0]}")
 
 
 def _camera(reader: RecordingReader, path: Path, notes: list[str]) -> bytes:

@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"{len(args.recording)} recordings, wanted one (--fleet shows several)")
     args.recording = args.recording[0]
     from ..recording.reader import RecordingReader
-    from ..recording.summary import damage_lines
+    from ..recording.summary import in_brackets, left_out_lines
 
     reader = RecordingReader(args.recording)
     from ..viewer.rerun_canvas import RerunCanvas, open_canvas
@@ -64,8 +64,8 @@ def run(args: argparse.Namespace) -> int:
             process = canvas.process if isinstance(canvas, RerunCanvas) else None
             counts = show(messages, canvas, truth=not args.no_truth)
             if not counts.total():
-                damage = "; ".join(damage_lines(reader))
-                raise UserError(f"{args.recording}: nothing in it that can be shown{damage and f' ({damage})'}")
+                why = in_brackets(left_out_lines(reader))
+                raise UserError(f"{args.recording}: nothing in it that can be shown{why}")
         mode = f"rrd:{args.rrd}" if args.rrd is not None else mode
         _say(args, mode, counts, None if process is None else process.web_url)
         tell_damage("view", reader)

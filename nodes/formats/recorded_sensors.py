@@ -18,7 +18,7 @@ from ..errors import UserError
 from ..node import Message
 from ..recording.reader import RecordingReader
 from ..recording.remote import path_of
-from ..recording.summary import damage_lines
+from ..recording.summary import left_out_lines
 from ..voices import VERDICT, RecordedVoices
 from .sensor_folder import Platform, SensorFolder, read_platform
 
@@ -74,7 +74,7 @@ def read_recorded_sensors(path: str | Path, platform_file: Path | None = None) -
     time_s = (np.array([b.time_ns for b in imu], dtype=np.int64) - start_ns) * 1e-9
     rate = np.array([(b.rate_x, b.rate_y, b.rate_z) for b in imu])
     force = np.array([(b.force_x, b.force_y, b.force_z) for b in imu])
-    notes = [*damage_lines(reader), *voices.lines()]
+    notes = [*left_out_lines(reader), *voices.lines()]
     if platform_file is not None:
         platform = read_platform(platform_file, notes)
     else:

@@ -34,6 +34,8 @@ MAX_RECORD = 1 << 32
 PRIVATE = 0x80
 #: A record outside chunks that is larger is looked into: its length may be damaged, and skipping it skip whole chunks.
 _LARGE = 1 << 16
+#: What is wrong with the last bytes of a file that was cut off, or that is just being written.
+_CUT = "the file ends inside a record"
 #: What a chunk may unpack to; more is damage, or an attack on the memory.
 MAX_CHUNK = 1 << 30
 #: What a chunk record holds beside the name of its compression and its data.
@@ -56,6 +58,11 @@ class Damage:
     offset: int
     length: int
     reason: str
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether it is the end of a file that may have gone on."""
+        return self.reason == _CUT
 
     def __str__(self) -> str:
         return f"{self.reason} at byte {self.offset} ({self.length} bytes)"
@@ -148,7 +155,7 @@ def records(buffer: memoryview) -> Iterator[Record | WholeChunk | Damage]:
             at = _next_chunk(buffer, position + 1, size)
             if at is None:
                 cut = _plausible(buffer, position)
-                yield Damage(position, size - position, "the file ends inside a record" if cut else "garbage")
+                yield Damage(position, size - position, _CUT if cut else "garbage")
                 return
             reason = found.reason if isinstance(found, Damage) else "a damaged record"
             found, following = Damage(position, at - position, reason), at

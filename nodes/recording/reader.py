@@ -62,7 +62,7 @@ class RecordingReader:
     damage : stretches of the file that cannot be read
     complete : whether the file ends as it should
     attachments : files in the recording, which no command reads
-    problems : counts of messages that were skipped, by kind; ``last_problem`` says what was wrong with the newest
+    problems : counts of messages that were skipped, by kind; ``last_problems`` says what was wrong with the newest
     """
 
     def __init__(self, path: str | Path, *, salvage: bool = False, by_ranges: bool = False) -> None:
@@ -87,7 +87,7 @@ class RecordingReader:
         self.library = ""
         self._frame_begins_ns: int | None = None
         self.problems: Counter[str] = Counter()
-        self.last_problem = ""
+        self.last_problems: dict[str, str] = {}
         self._schemas: dict[int, tuple[int, str]] = {}
         self._data_end: tuple[int, int] | None = None  # where it begins, checksum of all before
         self._trust: dict[int, int] = {}
@@ -263,6 +263,14 @@ class RecordingReader:
                 self._define(scan.parse(content[position:end]), 2)
             position = end
 
+    @property
+    def grows(self) -> bool:
+        """Whether the file has become longer since it was opened; one elsewhere is not looked at again."""
+        try:
+            return self.remote is None and self.path.stat().st_size > self.size
+        except OSError:
+            return False
+
     def check_outside(self) -> str | None:
         """What is wrong with the bytes outside chunks; takes as long as reading the whole file."""
         if self._data_end is None or self.damage:
@@ -394,11 +402,16 @@ class RecordingReader:
             try:
                 body = codec.decode(raw.topic, raw.data)
             except ValueError as error:
-                self.problems["malformed"] += 1
-                self.last_problem = f"{raw.topic} {raw.envelope.sequence} of {raw.envelope.source!r}: {error}"
+                kind = "impossible" if isinstance(error, codec.ImpossibleValues) else "malformed"
+                self.note_problem(kind, f"{raw.topic} {raw.envelope.sequence} of {raw.envelope.source!r}: {error}")
                 continue
             e = raw.envelope
             yield Message(raw.topic, e.stamp_ns, body, e.source, e.sequence, e.start)
+
+    def note_problem(self, kind: str, text: str) -> None:
+        """Count a message that is skipped."""
+        self.problems[kind] += 1
+        self.last_problems[kind] = text
 
     def first(self, topic: str) -> Any | None:
         """The body of the first message of a topic, None where there is none."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +15,8 @@ from ..last_problems import in_words
 from .reader import RecordingReader
 from .usable import usable
 
-_NO_END = "the file has no end: it is being written, was cut off, or its writer was killed"
+#: What a note on the file begins with, among notes on other things.
+OF_RECORDING = "recording: "
 #: Families whose stamps tell when a flight was.
 _TIMED = (Family.SENSOR, Family.OBSERVATION, Family.RESULT, Family.TRUTH)
 
@@ -119,6 +121,7 @@ class Holdings:
     span_ns : first and last stamp of what was measured and computed, see `time_span_ns`
     topics : summaries by topic
     damage : what cannot be read, one line each
+    unfit : what can be read and makes no sense, one line each
     """
 
     file: str
@@ -127,6 +130,7 @@ class Holdings:
     span_ns: tuple[int, int] | None
     topics: list[TopicSummary]
     damage: list[str]
+    unfit: list[str]
 
     @property
     def duration_s(self) -> float:
@@ -135,10 +139,10 @@ class Holdings:
 
 
 def holdings(reader: RecordingReader) -> Holdings:
-    """What a recording holds; messages that were found unusable so far count as damage."""
+    """What a recording holds; messages are judged as far as they were decoded."""
     return Holdings(
         str(reader.path), reader.size, len(reader.channel_of), time_span_ns(reader), topic_summaries(reader),
-        damage_lines(reader),
+        damage_lines(reader), unfit_lines(reader),
     )  # fmt: skip
 
 
@@ -155,19 +159,47 @@ def _several_platforms(reader: RecordingReader) -> list[str]:
 
 
 def damage_lines(reader: RecordingReader) -> list[str]:
-    """What of a recording cannot be read or used, in words; the messages are judged as far as they were decoded."""
+    """What of a recording cannot be read, in words; the messages are judged as far as they were decoded."""
     lines = _several_platforms(reader)
-    if reader.damage:
-        n, lost, first = len(reader.damage), sum(d.length for d in reader.damage), reader.damage[0]
+    places = [d for d in reader.damage if not d.is_cut]
+    if places:
+        n, lost, first = len(places), sum(d.length for d in places), places[0]
         several = f"{n} damaged places ({lost} bytes); the first: {first}"
         lines.append("skipped " + (several if n > 1 else f"1 damaged place: {first}"))
-    elif not reader.complete:
-        lines.append(_NO_END)
+    lines += _open_end(reader)
     if reader.problems["without a channel"]:
         lines.append(f"skipped {reader.problems['without a channel']} messages without a channel")
     if reader.problems["malformed"]:
-        lines.append(f"skipped {reader.problems['malformed']} unusable messages; the last: {reader.last_problem}")
+        n, last = reader.problems["malformed"], reader.last_problems["malformed"]
+        lines.append(f"skipped {n} unusable messages; the last: {last}")
     return lines
+
+
+def _open_end(reader: RecordingReader) -> list[str]:
+    """A line where a file does not end as it should: of a flight that goes on, or of one that was cut off."""
+    cut = [d for d in reader.damage if d.is_cut]
+    if reader.complete or (reader.damage and not cut):
+        return []
+    what = str(cut[0]) if cut else "the file has no end"
+    why = "it is being written, was cut off, or its writer was killed"
+    return [f"{what}, and grows: it is being written" if reader.grows else f"{what}: {why}"]
+
+
+def unfit_lines(reader: RecordingReader) -> list[str]:
+    """What of a recording was sent with values that no publisher may send, in words, as far as it was decoded."""
+    n = reader.problems["impossible"]
+    last = reader.last_problems.get("impossible")
+    return [f"{n} message{'s' * (n > 1)} sent with impossible values; the last: {last}"] if n else []
+
+
+def left_out_lines(reader: RecordingReader) -> list[str]:
+    """What of a recording is not used, because it cannot be read or makes no sense."""
+    return [*damage_lines(reader), *unfit_lines(reader)]
+
+
+def not_whole(reader: RecordingReader) -> list[str]:
+    """What is wrong with the bytes of a recording, place by place."""
+    return [*(str(damage) for damage in reader.damage if not damage.is_cut), *_open_end(reader)]
 
 
 def held_topics(reader: RecordingReader) -> str:
@@ -179,8 +211,12 @@ def held_topics(reader: RecordingReader) -> str:
 
 def lacking(reader: RecordingReader, what: str) -> UserError:
     """The error of a recording in which something is missing, with the damage that may be why."""
-    damage = "; ".join(damage_lines(reader))
-    return UserError(f"{reader.path}: {what}{damage and f' ({damage})'}")
+    return UserError(f"{reader.path}: {what}{in_brackets(left_out_lines(reader))}")
+
+
+def in_brackets(lines: Sequence[str]) -> str:
+    """What follows an error to say what may be why."""
+    return f" ({'; '.join(lines)})" if lines else ""
 
 
 def findings(reader: RecordingReader, *, decode: bool = True, outside: bool = True) -> list[str]:
@@ -188,12 +224,10 @@ def findings(reader: RecordingReader, *, decode: bool = True, outside: bool = Tr
 
     ``decode`` looks into every message and into what nodes would use, ``outside`` at the bytes between chunks, too.
     """
-    found = [str(damage) for damage in reader.damage]
+    found = not_whole(reader)
     wrong = reader.check_outside() if outside else None
     if wrong is not None:
         found.append(wrong)
-    if not reader.complete and not reader.damage:
-        found.append(_NO_END)
     if not any(channel.known for channel in reader.channels.values()):
         held = ", ".join(sorted({channel.topic for channel in reader.channels.values()})[:3])
         found.append(f"foreign: no topic of triline in it{', only ' + held if held else ''}")
@@ -217,8 +251,9 @@ def findings(reader: RecordingReader, *, decode: bool = True, outside: bool = Tr
             found.append(f"{sum(left_out.values())} messages that nodes leave out for their stamps or numbers; {last}")
         found += used.notes
         if reader.problems["malformed"]:
-            number = reader.problems["malformed"]
-            found.append(f"{number} messages that cannot be used; the last: {reader.last_problem}")
+            number, last = reader.problems["malformed"], reader.last_problems["malformed"]
+            found.append(f"{number} messages that cannot be used; the last: {last}")
+        found += unfit_lines(reader)
     return found
 
 

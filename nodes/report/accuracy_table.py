@@ -87,7 +87,7 @@ def _conclusion(result: dict[str, Any], points: dict[str, Any]) -> list[str]:
 
 def early_lines(result: dict[str, Any]) -> list[str]:
     """A line for each strip that was planned longer than it was recorded."""
-    what = "the recording is cut off" if result.get("damage") else "flight ended early"
+    what = "the recording ends early" if result.get("damage") else "flight ended early"
     return [
         f"{what}: strip {s['strip']} after {s['flown_s']:.1f} s of {s['planned_s']:.1f} s planned"
         for s in result["ended_early"]

@@ -14,6 +14,7 @@ from ..jobs.driver import Progress
 from ..jobs.plan import Plan
 from ..jobs.records import read_record, write_whole
 from ..jobs.steps import STEPS
+from ..recording.summary import OF_RECORDING
 from .evaluation import triangulated
 from .integrity import LIGHTS
 
@@ -104,7 +105,7 @@ def _step(plan: Plan, name: str, progress: Progress) -> dict[str, Any]:
 
 def _damage(told: dict[str, Any]) -> list[str]:
     """What of a recording a command could not read; `adjust` says it among its notes."""
-    sign = "damaged recording: "
+    sign = OF_RECORDING
     noted = [note.removeprefix(sign) for note in told.get("notes") or () if note.startswith(sign)]
     return told.get("damage") or noted
 
@@ -162,7 +163,7 @@ def table_lines(rows: Sequence[dict[str, Any]], every: bool = False) -> list[str
             + (" m" if row["rmse_m"] else "")
         )
         if row["damage"]:
-            lines.append(f"{'':<{width}}  damaged recording: {'; '.join(row['damage'])}")
+            lines.append(f"{'':<{width}}  {OF_RECORDING}{'; '.join(row['damage'])}")
         lines += [f"{'':<{width}}  {text}" for text in row["incomplete"]]
     if len(shown) < len(rows):
         lines.append(f"... and {len(rows) - len(shown)} more, in summary.csv (-v prints all)")

@@ -40,4 +40,5 @@ def read(recording: str | Path) -> tuple[Flight, Holdings]:
     held = holdings(reader)
     if held.span_ns:
         flight.start_ns, flight.end_ns = held.span_ns
+    flight.not_used += held.unfit
     return flight, held

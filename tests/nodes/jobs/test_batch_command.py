@@ -165,7 +165,7 @@ def test_a_recording_that_is_cut_off_is_told(season, steps, capsys):
     assert main(["batch", "season/day1", "-o", "out", "--do", steps, "--workers", "2", *pace]) == 0
     told = "the file ends inside a record at byte"
     out = capsys.readouterr().out
-    assert out.count("damaged recording: ") == 1 and told in out
+    assert out.count("  recording: ") == 1 and told in out
     *good, cut = summary()["flights"]
     assert [row["damage"] for row in good] == [[]] * (steps == "adjust")
     assert told in cut["damage"][0] and cut["state"] == "finished"

@@ -19,7 +19,7 @@ from triline.nodes.errors import UserError
 from triline.nodes.node import Message
 from triline.nodes.ordering import order_key
 from triline.nodes.recording.reader import RecordingReader
-from triline.nodes.recording.summary import findings, topic_summaries
+from triline.nodes.recording.summary import damage_lines, findings, holdings, left_out_lines, topic_summaries
 from triline.nodes.recording.writer import RecordingWriter
 from triline.schemas import codec
 from triline.schemas import messages as m
@@ -106,8 +106,44 @@ def test_bad_payloads_are_skipped_and_counted(tmp_path):
         writer.write_raw(RawMessage("sensor/imu", envelope, codec.encode(nan), 1))
     reader = RecordingReader(tmp_path / "a.mcap")
     assert len(list(reader.messages())) == 1
-    assert reader.problems["malformed"] == 2
-    assert "rate_x is not finite" in reader.last_problem
+    assert reader.problems == {"malformed": 1, "impossible": 1, "without a channel": 0}
+    assert "sensor/gnss 1 of 'test': not a foxglove.LocationFix" in reader.last_problems["malformed"]
+    assert "rate_x is not finite" in reader.last_problems["impossible"]
+
+
+def test_impossible_values_are_no_damage_of_the_file(tmp_path):
+    """A report named a recording damaged in which a receiver had said NaN."""
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        for k in range(3):
+            fix = sample.body("sensor/gnss", k)
+            fix.latitude = fix.latitude if k else float("nan")
+            writer.write(Message("sensor/gnss", sample.EPOCH_NS + k, fix, "test", k))
+    reader = RecordingReader(tmp_path / "a.mcap")
+    assert len(list(reader.messages())) == 2
+    said = "1 message sent with impossible values; the last: sensor/gnss 0 of 'test': latitude is not finite"
+    held = holdings(reader)
+    assert held.damage == [] and held.unfit == [said] and left_out_lines(reader) == [said]
+    assert said in findings(RecordingReader(tmp_path / "a.mcap"))
+
+
+def test_a_file_without_an_end_that_grows_is_being_written(tmp_path):
+    whole = tmp_path / "whole.mcap"
+    write_recording(whole, sample.flight(1.0), chunk_size=2048)
+    data = whole.read_bytes()
+    growing = tmp_path / "growing.mcap"
+    for cut, said in ((8, "the file has no end"), (len(data) // 2, "the file ends inside a record at byte ")):
+        growing.write_bytes(data[:-cut])
+        reader = RecordingReader(growing)
+        (line,) = damage_lines(reader)
+        assert line.startswith(said) and line.endswith(": it is being written, was cut off, or its writer was killed")
+        with open(growing, "ab") as file:
+            file.write(data[-cut:][:7])
+        (line,) = damage_lines(reader)
+        assert line.startswith(said) and line.endswith(", and grows: it is being written")
+        assert findings(reader, decode=False) == [line]
+    reader = RecordingReader(whole)
+    whole.write_bytes(data + b"more")
+    assert not damage_lines(reader)  # it has its end; what comes behind is another's
 
 
 # ---- damage

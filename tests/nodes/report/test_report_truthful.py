@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from copy import deepcopy
 from dataclasses import replace
 from itertools import pairwise
 
@@ -51,13 +52,35 @@ def test_damage_is_named_on_the_terminal_in_the_json_and_at_the_top_of_the_repor
     assert main(["analyze", str(cut), "-o", str(target), "-q"]) == 0
     said = capsys.readouterr()
     assert said.out == "" and len(said.err.splitlines()) == 1
-    assert "skipped 1 damaged place: the file ends inside a record at byte" in said.err
+    ends = "the file ends inside a record at byte"
+    assert ends in said.err and "it is being written, was cut off" in said.err
     text = target.read_text()
-    assert 0 < text.index("Damaged recording: skipped 1 damaged place") < text.index("<section>")
+    assert 0 < text.index(f"Recording: {ends}") < text.index("<section>")
     assert main(["analyze", str(cut), "-o", str(target), "--json"]) == 0
-    assert "skipped 1 damaged place" in json.loads(capsys.readouterr().out)["damage"][0]
+    assert ends in json.loads(capsys.readouterr().out)["damage"][0]
     assert main(["analyze", str(recording), "-o", str(target)]) == 0
-    assert "damage" not in capsys.readouterr().err and "Damaged" not in target.read_text()
+    assert "damage" not in capsys.readouterr().err and "Recording: " not in target.read_text()
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_values_that_cannot_be_are_not_called_damage_of_the_recording(messages, tmp_path, capsys):
+    """The page named a recording damaged in which a receiver had said NaN."""
+    changed = []
+    for message in messages:
+        if message.topic == "sensor/gnss":
+            body = deepcopy(message.body)
+            body.latitude = float("nan")
+            message = replace(message, body=body)
+        changed.append(message)
+    path, target = write_recording(tmp_path / "nan.mcap", changed), tmp_path / "report.html"
+    n = sum(message.topic == "sensor/gnss" for message in messages)
+    assert main(["analyze", str(path), "-o", str(target)]) == 0
+    said = f"{n} messages sent with impossible values; the last: sensor/gnss {n - 1} of "
+    assert said in capsys.readouterr().out and "Recording: " not in target.read_text()
+    assert f"Not used here, as in flight: {said}" in target.read_text()
+    assert main(["analyze", str(path), "-o", str(target), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["damage"] == [] and said in result["not_used"][-1]
 
 
 def test_nothing_but_configuration_is_said_to_be_too_little(messages, tmp_path, capsys):
