@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
+from ..formats.importable import refuse_importable
 from ..formats.json_text import json_text
 from ..formats.new_file import new_file
 from ..recording.remote import path_of
@@ -33,6 +34,7 @@ def write_report(recording: Path, output: Path) -> dict[str, Any]:
     """
     if not recording.exists():
         raise UserError(f"{recording}: no such file or folder")
+    refuse_importable(recording)
     from ..report.analysis import analyse
     from ..report.page import page
     from ..report.source import read

@@ -31,6 +31,7 @@ from ..formats.camera_json import write_camera
 from ..formats.features import NOT_PLACED, Features, answers, features_of
 from ..formats.geojson import write_geojson
 from ..formats.geopackage import write_geopackage
+from ..formats.importable import refuse_importable
 from ..formats.json_text import json_text
 from ..formats.line_orientation import (
     OrientedLines,
@@ -123,6 +124,7 @@ def run(args: argparse.Namespace) -> int:
             raise UserError(f"--{name}: wanted with {', '.join(flags)}{' and ' * bool(flags)}{last} only")
     refuse_input_as_output(args, kind)
     path = Path(args.recording)
+    refuse_importable(path)
     if kind in ("points", "per_line"):
         return _run_table(path, args)
     if args.topic is None:

@@ -26,6 +26,7 @@ from ...solver.navigation.post_processing import (
     zero_velocities,
 )
 from ..errors import UserError
+from ..formats.importable import refuse_importable
 from ..formats.json_text import json_text
 from ..formats.new_file import new_file, new_files, refuse_unless_folder
 from ..formats.recorded_sensors import read_recorded_sensors
@@ -80,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
     if source.is_dir():
         folder = read_sensor_folder(source, platform)
     else:
+        refuse_importable(source)
         folder = read_recorded_sensors(source, platform)
     inertial, gnss, findings = folder.cleaned()
     quiet = args.quiet or args.json

@@ -14,6 +14,7 @@ from ...solver.rectification.kernels import TAPS as IMAGE_TAPS
 from ..batch.rectification import ORIENTATIONS, Rectification, Rectified, line_blocks, project_frame
 from ..errors import UserError
 from ..formats.geotiff import write_orthoimage
+from ..formats.importable import refuse_importable
 from ..formats.json_text import json_text
 from ..formats.new_file import refuse_unless_file
 from ..formats.projection import notes_of_map
@@ -137,6 +138,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UserError(f"{args.input}: no such file")
     if args.input.is_dir():
         raise UserError(f"{args.input}: is a folder, wanted a recording with image lines")
+    refuse_importable(args.input)
     for path in (args.output, *(() if args.sigma is None else (Path(args.sigma),))):
         refuse_unless_file(path)
     if args.sigma is not None and Path(args.sigma).resolve() == args.output.resolve():

@@ -11,6 +11,7 @@ from ..bus.brake import Brake
 from ..bus.program import stop_on_signals
 from ..bus.session import Bus
 from ..convert import iso
+from ..formats.importable import refuse_importable
 from ..formats.json_text import json_text
 from ..player.player import first_stamp_ns, play, time_argument
 from ..recording.reader import RecordingReader
@@ -40,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    refuse_importable(args.recording)
     reader = RecordingReader(args.recording)
     if not len(reader.index.stamp_ns):
         raise lacking(reader, "nothing to play: no message in it")

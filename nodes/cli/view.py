@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import UserError
+from ..formats.importable import refuse_importable
 from ..formats.json_text import json_text
 from ..formats.new_file import new_file
 from ..node import Message
@@ -49,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
     if len(args.recording) != 1:
         raise UserError(f"{len(args.recording)} recordings, wanted one (--fleet shows several)")
     args.recording = args.recording[0]
+    refuse_importable(args.recording)
     from ..recording.reader import RecordingReader
     from ..recording.summary import in_brackets, left_out_lines
 

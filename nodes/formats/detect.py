@@ -27,6 +27,7 @@ from .gps_time import GPS_EPOCH_S, WEEK_S
 from .gpx import has_attitudes, is_gpx, position_messages, read_gpx, read_positions
 from .ground_height import NOT_GIVEN, GroundGiven
 from .image_lines import ImageStrip, LinesGiven, open_strip, with_lines
+from .other_kinds import other_kind
 from .pos_export import is_pos_export, read_pos_export
 from .ros2 import ros2_messages
 from .ros2_images import ImageTopics
@@ -153,11 +154,8 @@ def kind_of_path(path: Path) -> str:
         return "gpx"
     if head.lstrip().startswith(b"<?xml") or b"boost_serialization" in head:
         kind = kind_of(path)
-        if kind is None and b"dimap_document" in head.lower():
-            raise UserError(
-                f"{path}: metadata of a satellite scene, which `triline locate` reads; "
-                "`triline new scenes` makes a block of scenes for `triline adjust`"
-            )
+        if kind is None and (other := other_kind(path)):
+            raise UserError(f"{path}: {other}")
         if kind is None:
             raise UserError(f"{path}: XML of another kind, wanted {KINDS['ties']} or {KINDS['camera']}")
         return kind
@@ -179,6 +177,8 @@ def kind_of_path(path: Path) -> str:
         return "lines"
     if path.suffix.lower() == ".csv":  # its reader names the columns that are missing
         return "csv"
+    if other := other_kind(path):
+        raise UserError(f"{path}: {other}")
     raise UserError(f"{path}: of no known kind, wanted one of: {', '.join(KINDS)}")
 
 

@@ -1,4 +1,4 @@
-"""A word to who gives a command a file that it cannot read, but that `triline import` can."""
+"""A word to who gives a command a file in place of a recording, which it or another command reads."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ from ..recording.remote import RemotePath
 
 
 def refuse_importable(path: Path) -> None:
-    """Raise UserError where something is no recording, but becomes one by ``triline import``.
+    """Raise UserError where something is no recording, but becomes one by ``triline import`` or is for another command.
 
     Returns silently where nothing is there, or what is there is a recording, or of no known kind.
     """
     if isinstance(path, RemotePath) or not path.exists() or (path.is_file() and _is_mcap(path)):
         return
     from .detect import KINDS, kind_of_path  # imports the readers of all kinds
+    from .other_kinds import other_kind
 
     try:
         kind = kind_of_path(path)
     except UserError:
+        if other := other_kind(path):
+            raise UserError(f"{path}: {other}; wanted a recording") from None
         return
     target = "camera.json" if kind == "camera" else f"{path.stem}.mcap"
     command = f"triline import {shlex.quote(str(path))} -o {shlex.quote(target)}"

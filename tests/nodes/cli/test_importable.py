@@ -28,3 +28,38 @@ def test_importable_input_is_named_with_the_command(tmp_path, capsys, monkeypatc
     err = capsys.readouterr().err
     kind = "trajectory as CSV" if made == "poses.csv" else "flight folder"
     assert kind in err and f"triline import {made} -o" in err and err.count("\n") == 1
+
+
+CAMERA = '{"name": "c", "lenses": [{"focal_length_mm": 62.7}], "lines": [{"id": "F", "pixels": 2, "pixel_size_mm": 1}]}'
+FRAME = '{"interior": {"focal_length_mm": 50}, "exterior": {"lat_deg": 48}}'
+FILES = {
+    "camera.json": (CAMERA, "a line camera (camera.json), which lies in the folder of a block or flight"),
+    "image.json": (FRAME, "orientation of a frame camera's image, which `triline rectify --sensor`"),
+    "scene.json": ('{"name_model": "USGS"}', "community sensor model), which `triline locate` and"),
+    "map.geojson": ('{"type": "FeatureCollection"}', "GeoJSON, which"),
+    "a_RPC.TXT": ("LINE_OFF: +001.0 pixels\n", "rational polynomials of a satellite scene, which `triline locate`"),
+    "dim.xml": ('<?xml version="1.0"?><Dimap_Document/>', "metadata of a satellite scene, which `triline locate`"),
+    "flight.toml": ("[flight]\n", "settings of a flight folder, which is given as a whole"),
+}
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["adjust", "import", "process", "check", "info", "analyze", "replay", "view", "export", "rectify", "navigate"],
+)
+def test_what_is_for_another_command_is_named_with_that_command(tmp_path, capsys, monkeypatch, command):
+    """Of each was said that it is not an MCAP recording, by `import` that it is of no known kind."""
+    monkeypatch.chdir(tmp_path)
+    options = {
+        "process": ["-o", "out.mcap"],
+        "rectify": ["-o", "out.tif"],
+        "navigate": ["-o", "out"],
+        "import": ["-o", "out.mcap"],
+        "export": ["--points", "out.csv"],
+    }
+    for name, (text, said) in FILES.items():
+        (tmp_path / name).write_text(text)
+        assert main([command, name, *options.get(command, [])]) == 1
+        err = capsys.readouterr().err
+        assert f"triline {command}: {name}: " in err and said in err and err.count("\n") == 1, err
+        assert ("wanted a recording" in err) == (command != "import")

@@ -246,7 +246,7 @@ def test_damaged_files_are_read_or_refused_in_one_line(name, tmp_path):
 
 
 def test_import_names_locate(tmp_path):
-    with pytest.raises(UserError, match=r"metadata of a satellite scene, which `triline locate` reads"):
+    with pytest.raises(UserError, match=r"metadata of a satellite scene, which `triline locate` and"):
         kind_of_path(write_dimap2(tmp_path / "scene.xml", TRUTH))
 
 

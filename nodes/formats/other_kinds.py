@@ -1,0 +1,57 @@
+"""What a file is that is neither a recording nor becomes one, and which command reads it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .frame_json import is_frame_json
+
+#: Bytes of a file that are looked at.
+_HEAD = 1 << 16
+#: Files of settings -> whose they are.
+_SETTINGS = {
+    "flight.toml": "settings of a flight folder",
+    "project.toml": "settings of a block folder",
+    "platform.toml": "settings of a sensor folder",
+}
+
+
+def other_kind(path: Path) -> str | None:
+    """What a file seems to be, and which command wants it, in words that follow its name; None where nobody knows."""
+    if not path.is_file():
+        return None
+    with open(path, "rb") as file:
+        head = file.read(_HEAD)
+    suffix, name = path.suffix.lower(), path.name
+    if is_frame_json(path):
+        return "orientation of a frame camera's image, which `triline rectify --sensor` and `triline locate` read"
+    if suffix in (".json", ".isd") or head.lstrip().startswith(b"{"):
+        return _of_json(head)
+    if suffix in (".rpb", ".geom") or name.upper().endswith("_RPC.TXT") or b"LINE_OFF" in head.upper():
+        return _scene("rational polynomials of a satellite scene")
+    if b"dimap_document" in head[:512].lower():
+        return _scene("metadata of a satellite scene")
+    if name in _SETTINGS:
+        return f"{_SETTINGS[name]}, which is given as a whole"
+    return None
+
+
+def _of_json(head: bytes) -> str | None:
+    if b'"lenses"' in head and b'"lines"' in head:
+        return (
+            "a line camera (camera.json), which lies in the folder of a block or flight, "
+            "or stands behind --camera of `triline import`, `process` and `adjust`"
+        )
+    if b'"name_model"' in head:
+        return _scene("metadata of a satellite scene (community sensor model)")
+    if b'"FeatureCollection"' in head:
+        return "GeoJSON, which triline writes and does not read"
+    return None
+
+
+def _scene(what: str) -> str:
+    """What is said of metadata of a scene."""
+    return (
+        f"{what}, which `triline locate` and `rectify --sensor` read; "
+        "`triline new scenes` makes a block of scenes for `triline adjust`"
+    )
