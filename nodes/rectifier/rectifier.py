@@ -12,7 +12,7 @@ import numpy as np
 from ...schemas import messages as m
 from ...schemas.image_lines import LineBlock
 from ...schemas.topics import CONFIGURATION, POSES
-from ...solver.camera.line_camera import LineCamera
+from ...solver.camera.line_camera import CcdLine, LineCamera
 from ...solver.geometry.frames import LocalFrame
 from ...solver.geometry.rotation import matrix_from_angles
 from ...solver.matching.line_quality import full_scale_of
@@ -101,6 +101,8 @@ class Rectifier(Node):
         self._steepest: SteepestLine | None = None
         # by CCD line, strip and time of a line whose orientation is to be looked at
         self._awaited: dict[str, tuple[str, float]] = {}
+        self._kept: dict[str, deque[LineBlock]] = {}  # its lines, in case that they are to be shown
+        self._kept_bytes = 0
         self._notes: list[Message] = []
         self._factor = 1
         self._next_line: dict[str, int] = {}
@@ -126,16 +128,19 @@ class Rectifier(Node):
             self._take(message)
         except ValueError as error:
             self.refuse("malformed", f"{message.topic}: {error}")
-        notes, self._notes = self._notes, []
         if self._stamp_ns < self._next_publish_ns:
-            return notes
+            return self._said()
         self._next_publish_ns = self._stamp_ns + self._publish_ns
         self._work()
-        return notes + self._changed_tiles()
+        return self._said() + self._changed_tiles()
 
     def finish(self) -> Iterable[Message]:
         self._work(everything=True)
-        return self._changed_tiles()
+        return self._said() + self._changed_tiles()
+
+    def _said(self) -> list[Message]:
+        notes, self._notes = self._notes, []
+        return notes
 
     def state(self) -> str:
         if self._camera is None or self._frame is None:
@@ -218,19 +223,36 @@ class Rectifier(Node):
             self._choose_line(self._camera)
         if ccd not in self._camera.line_index:
             raise ValueError(f"unknown CCD line {ccd!r}")
+        line = self._camera.lines[self._camera.line_index[ccd]]
         if self._steepest is not None and self._steepest.wants(self._camera.line_index[ccd]):
+            if ccd != self._camera.lines[self._line].id:
+                _refuse_size(line, block)
+                self._keep(ccd, block)
+                self._look_down(self._camera, self._steepest, ccd, block)
+                return
             self._look_down(self._camera, self._steepest, ccd, block)
-        line = self._camera.lines[self._line]
-        if ccd != line.id:
-            return
+        if ccd == self._camera.lines[self._line].id:
+            self._show(line, block)
+
+    def _keep(self, ccd: str, block: LineBlock) -> None:
+        """Keep lines of a lens that nobody has looked at, as far as the budget goes."""
+        self._kept.setdefault(ccd, deque()).append(block)
+        self._kept_bytes += block.pixels.nbytes
+        while self._kept_bytes > self._budget:
+            most = max(self._kept, key=lambda name: len(self._kept[name]))
+            self._kept_bytes -= self._kept[most].popleft().pixels.nbytes
+            self.problem("lines given up", f"lines of {most} were more than budget_mb before an orientation came")
+
+    def _show(self, line: CcdLine, block: LineBlock) -> None:
+        """Hand lines of the CCD line that is shown on, those of an unknown strip once it is announced."""
+        ccd = line.id
         if block.strip not in self._strips:
             self._unknown.append((self._stamp_ns, replace(block, ccd=ccd)))
             while self._unknown and self._stamp_ns - self._unknown[0][0] > UNKNOWN_NS:
                 strip = self._unknown.popleft()[1].strip
                 self.problem("unknown strip", f"lines of {ccd} name strip {strip!r}")
             return
-        if block.pixels.shape[1] != line.pixels:
-            raise ValueError(f"lines of {ccd} of {block.pixels.shape[1]} samples, wanted {line.pixels}")
+        _refuse_size(line, block)
         first = int(block.first_line)
         late = min(max(self._next_line.get(block.strip, first) - first, 0), len(block.pixels))
         if late:
@@ -251,7 +273,10 @@ class Rectifier(Node):
         self._factor = -(-camera.lines[self._line].pixels // self._samples)
 
     def _look_down(self, camera: LineCamera, steepest: SteepestLine, ccd: str, block: LineBlock) -> None:
-        """Look at the first orientation of a lens, and show its lines from now on where they look down more steeply."""
+        """Look at the first orientation of a lens, and show its lines from now on where they look down more steeply.
+
+        ``block`` is the newest one of it.
+        """
         measured = self.images["live"].measured
         here = block.strip, self._seconds(int(block.times_ns()[0]))
         strip, time_s = self._awaited.setdefault(ccd, here)
@@ -261,6 +286,8 @@ class Rectifier(Node):
             return
         pose = measured.at([time_s]).poses
         tilts = steepest.see(camera.line_index[ccd], strip, pose.position_l[0], matrix_from_angles(*pose.angles[0]))
+        kept = self._kept.pop(ccd, ())
+        self._kept_bytes -= sum(one.pixels.nbytes for one in kept)
         if tilts is None:
             return
         before = camera.lines[self._line].id
@@ -278,6 +305,8 @@ class Rectifier(Node):
             )
             body = convert.log_line(self.name, text, self._stamp_ns)
             self._notes.append(Message("event/log", self._stamp_ns, body))
+        for one in kept:
+            self._show(camera.lines[self._line], one)
 
     def _reduced(self, lines: WaitingLines) -> None:
         """Put pixels together and hand lines on; what does not fill a group waits for the next block."""
@@ -306,6 +335,10 @@ class Rectifier(Node):
     def _work(self, everything: bool = False) -> None:
         if self._line < 0 or self._camera is None or self._frame is None:
             return
+        if self._steepest is not None:
+            for ccd, blocks in list(self._kept.items()):  # the last ones of a flight, too
+                if blocks:
+                    self._look_down(self._camera, self._steepest, ccd, blocks[-1])
         self._look_at_ground(self._camera, self._frame)
         self._follow_camera(self._camera)
         for version, image in self.images.items():
@@ -376,3 +409,8 @@ class Rectifier(Node):
             encoding="mono8", data=image.mosaic.tiles[key].tobytes(), ccd=self._camera.lines[self._line].id,
             strip=image.strip, newest_time_ns=self._reference_ns + round(image.newest_s * convert.SECOND_NS),
         )  # fmt: skip
+
+
+def _refuse_size(line: CcdLine, block: LineBlock) -> None:
+    if block.pixels.shape[1] != line.pixels:
+        raise ValueError(f"lines of {line.id} of {block.pixels.shape[1]} samples, wanted {line.pixels}")

@@ -74,6 +74,9 @@ class _Aircraft:
         self.control: dict[str, Array] = {}
         self.control_changed = False
         self.tiles: dict[tuple[int, int], Any] = {}
+        self.ccd: str | None = None  # whose tiles are shown, and from which stamp on
+        self.ccd_ns = 0
+        self.tiles_gone = False  # those that were drawn are of another one
         self.light = self.reason = ""
         self.linked = True
         self.waiting: list[Message] = []
@@ -156,10 +159,22 @@ class FleetScene:
             aircraft.light, aircraft.reason = body.light, body.light_reason
         elif topic.startswith("orthoimage/"):
             if body.encoding == "mono8" and 0 < body.size <= LARGEST_TILE and len(body.data) == body.size**2:
-                aircraft.tiles[body.row, body.column] = body
+                self._take_tile(aircraft, message)
         elif topic == "event/log":
             level = {"ERROR": "ERROR", "WARNING": "WARN"}.get(convert.enum_name(type(body).Level, body.level).upper())
             self._canvas.event("log", f"{aircraft.name}: {body.message}", level or "INFO")
+
+    def _take_tile(self, aircraft: _Aircraft, message: Message) -> None:
+        """Tiles of another CCD line, to which the rectifier has changed over, take the place of all before."""
+        tile = message.body
+        if aircraft.ccd is not None and tile.ccd != aircraft.ccd:
+            if message.stamp_ns < aircraft.ccd_ns:
+                return  # one of before, which came late over the link
+            aircraft.tiles.clear()
+            aircraft.tiles_gone = True
+        if tile.ccd != aircraft.ccd:
+            aircraft.ccd, aircraft.ccd_ns = tile.ccd, message.stamp_ns
+        aircraft.tiles[tile.row, tile.column] = tile
 
     def _place(self, aircraft: _Aircraft, position_l: Array) -> Array:
         """Display position: in the frame of the first aircraft, less a rounded origin."""
@@ -220,6 +235,9 @@ class FleetScene:
         self._draw_tiles(aircraft)
 
     def _draw_tiles(self, aircraft: _Aircraft) -> None:
+        if aircraft.tiles_gone:
+            aircraft.tiles_gone = False
+            self._canvas.clear(f"mosaic/{aircraft.name}")
         for (row, column), tile in aircraft.tiles.items():
             grey = np.frombuffer(tile.data, dtype=np.uint8).reshape(tile.size, tile.size)
             if not grey.any():

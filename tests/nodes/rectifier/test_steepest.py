@@ -69,12 +69,12 @@ def test_the_live_orthoimage_of_a_triplet_is_that_of_the_lens_that_looks_down(tm
     assert said == (
         "CCD line N looks down more steeply than F (0.2 and 23.6 deg off): the orthoimage shows it from now on"
     )
-    tiles = [tiles_of(reader, version) for version in ("live", "final")]
+    tiles = [tiles_of(reader.messages(), version) for version in ("live", "final")]
     # the whole strip of N, as if F had not been
     (tmp_path / "nodes.toml").write_text('[rectifier]\nccd = "N"\n')
     words = ["process", str(flight), "-o", str(out), "--nodes", "rectifier", "--config", str(tmp_path / "nodes.toml")]
     assert main([*words, "-q"]) == 0
-    assert tiles == [tiles_of(RecordingReader(out), version) for version in ("live", "final")]
+    assert tiles == [tiles_of(RecordingReader(out).messages(), version) for version in ("live", "final")]
 
 
 def test_a_lens_is_looked_at_where_poses_come_long_after_its_lines(tmp_path):
@@ -87,23 +87,33 @@ def test_a_lens_is_looked_at_where_poses_come_long_after_its_lines(tmp_path):
     poses = sorted(message.stamp_ns for message in messages if message.topic.startswith("trajectory/"))
     assert sum(stamp > begin_ns for stamp in poses) > 10
 
-    def comes_ns(message):
-        return message.stamp_ns + 1_000_000_000 * message.topic.startswith("trajectory/")
+    def put_out(late_s, **settings):
+        """What the rectifier says where poses come so much later than what they belong to."""
+        rectifier = Rectifier(**settings)
+        wanted = tuple(name.rstrip("*") for name in rectifier.inputs)
 
-    rectifier = Rectifier()
-    wanted = tuple(name.rstrip("*") for name in rectifier.inputs)
-    said = [
-        out
-        for message in sorted(messages, key=comes_ns)
-        if message.topic.startswith(wanted)
-        for out in rectifier.step(message)
-    ]
-    said += rectifier.finish()
+        def comes_ns(message):
+            return message.stamp_ns + round(late_s * 1e9) * message.topic.startswith("trajectory/")
+
+        used = (message for message in sorted(messages, key=comes_ns) if message.topic.startswith(wanted))
+        return [*(out for message in used for out in rectifier.step(message)), *rectifier.finish()], rectifier
+
+    said, _ = put_out(1.0)
     assert {out.body.ccd for out in said if out.topic == "orthoimage/final"} == {"N"}
     assert any("CCD line N looks down more steeply than F" in out.body.message for out in said if out.topic[0] == "e")
+    # its lines of before the first pose are in it, also where all poses come after all lines
+    for late_s in (1.0, 1e4):
+        said, rectifier = put_out(late_s)
+        alone, _ = put_out(late_s, ccd="N")
+        for version in ("live", "final"):
+            assert tiles_of(said, version) == tiles_of(alone, version) != {}
+        assert "lines given up" not in rectifier.counters
+    # lines of before are given up where they are too many
+    said, rectifier = put_out(1e4, budget_mb=1e-3)
+    assert "were more than budget_mb" in rectifier.last_problems["lines given up"]
 
 
-def tiles_of(reader, version):
+def tiles_of(messages, version):
     """The tiles of N at the end."""
-    tiles = (tile.body for tile in reader.messages([f"orthoimage/{version}"]))
+    tiles = (tile.body for tile in messages if tile.topic == f"orthoimage/{version}")
     return {(tile.row, tile.column): tile.data for tile in tiles if tile.ccd == "N"}

@@ -147,6 +147,7 @@ class Canvas(NullCanvas):
         self.drawn: dict[str, list] = {}
         self.layouts: list[FleetLayout] = []
         self.text = ""
+        self.pictures: set[str] = set()
 
     def lines(self, entity, strips, colors, radius, labels=None) -> None:
         self.drawn[entity] = list(strips)
@@ -156,6 +157,12 @@ class Canvas(NullCanvas):
 
     def layout(self, layout) -> None:
         self.layouts.append(layout)
+
+    def picture(self, entity, corners, grey) -> None:
+        self.pictures.add(entity)
+
+    def clear(self, entity) -> None:
+        self.pictures = {name for name in self.pictures if not name.startswith(f"{entity}/")}
 
     def document(self, entity, markdown) -> None:
         self.text = markdown
@@ -195,3 +202,28 @@ def test_aircraft_of_two_projects_are_drawn_in_one_frame_and_a_gap_is_filled_lat
         scene.take("a1", pose("orientation/final", second, (100.0 * second, 0.0, 1000.0)), 3.0)
     scene.draw(3.0)
     assert [len(piece) for piece in canvas.drawn["flight/a1/final"]] == [22]
+
+
+def test_tiles_of_another_ccd_line_take_the_place_of_all_before_of_the_same_aircraft():
+    """Tiles of the lens that looks forward stayed under those of the one that looks down."""
+    canvas = Canvas()
+    scene = FleetScene(canvas)
+    project = m.Project(name="one", crs="local", origin_latitude=48.0, origin_longitude=9.0, origin_height=300.0)
+    for name in ("a1", "a2"):
+        scene.take(name, Message("configuration/project", 0, project), 0.0)
+
+    def tile(name, version, ccd, column, stamp_ns):
+        grey = bytes([100]) * 16
+        body = m.GroundTile(column=column, size=4, gsd_m=1.0, x=4.0 * column, encoding="mono8", data=grey, ccd=ccd)
+        scene.take(name, Message(f"orthoimage/{version}", stamp_ns, body), 0.0)
+
+    for name, column in (("a1", 0), ("a1", 1), ("a2", 0)):
+        tile(name, "live", "F", column, 5)
+    scene.draw(1.0)
+    tile("a1", "live", "F", 2, 9)  # not drawn before the next one comes
+    tile("a1", "live", "N", 3, 10)
+    tile("a1", "final", "F", 4, 9)  # late over the link
+    scene.draw(2.0)
+    tile("a1", "final", "N", 5, 12)
+    scene.draw(3.0)
+    assert canvas.pictures == {"mosaic/a2/0_0", "mosaic/a1/0_3", "mosaic/a1/0_5"}
