@@ -19,7 +19,7 @@ from .steps import PROCESSED
 #: Ending of recordings: what is taken of a folder.
 RECORDING = ".mcap"
 _PATTERN = re.compile(r"[*?\[]")
-_UNUSUAL = re.compile(r"[^\w.+=@ -]")
+_UNUSUAL = re.compile(r"[^\w.+=@ ,()-]")
 
 
 @dataclass(frozen=True)

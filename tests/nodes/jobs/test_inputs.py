@@ -103,6 +103,13 @@ def test_names_of_a_store_lead_nowhere_else(season):
     assert found == ["a_b_", "plain", "x/__/__/__/etc/evil"]
 
 
+def test_names_that_are_alike_stay_and_are_apart(season):
+    """Parentheses, as browsers put them behind a name, became underscores."""
+    for name in ("s/a-1.mcap", "s/a_1.mcap", "s/a 1.mcap", "s/a (1).mcap"):
+        Path(name).write_bytes(b"x")
+    assert names("s/a*.mcap") == ["a (1)", "a 1", "a-1", "a_1"]
+
+
 def test_two_that_would_share_a_folder_are_refused(season):
     for name in ("s/a?.mcap", "s/a!.mcap"):
         Path(name).write_bytes(b"x")
