@@ -61,7 +61,8 @@ class Node:
         self.counters: Counter[str] = Counter()
         self.last_problem = ""  # the newest
         self.last_problems: dict[str, str] = {}  # the newest of each kind
-        self.refusals = 0  # messages of which nothing could be used
+        self.refusals = 0  # messages of which nothing could be used when they came
+        self.refused_later: Counter[str] = Counter()  # of those that had waited in the node; by topic, runners take it
         self.alarms: dict[str, str] = {}  # what an operator has to look at now, by kind; runners set some of them
 
     def step(self, message: Message) -> Iterable[Message]:

@@ -380,7 +380,7 @@ class Adjuster(Node):
         if not self._strips.any_held:
             ties, self._strips.held_ties = self._strips.held_ties, []
             for body, source in ties:
-                self._tie(body, source)
+                self._tie(body, source, waited=True)
 
     def _verdict(self, body: Any) -> list[Message]:
         if body.topic:  # about who speaks on a topic, or its clock
@@ -416,11 +416,11 @@ class Adjuster(Node):
         pixels = {line.id: len(line.x_mm) for line in self._camera.lines}
         before = self._pacing.left_out_total
         for body, source in self._pacing.take_waiting(rates, starts, pixels):
-            self._tie(body, source)
+            self._tie(body, source, waited=True)
         if self._pacing.left_out_total > before:
             self.counters["left out because of the load"] += self._pacing.left_out_total - before
 
-    def _tie(self, body: Any, source: str) -> None:
+    def _tie(self, body: Any, source: str, waited: bool = False) -> None:
         assert self._window is not None
         if self._strips.is_held(body):
             self._strips.held_ties.append((body, source))
@@ -443,7 +443,10 @@ class Adjuster(Node):
             if reason not in GOES_ON:
                 where = f"strip {look.strip!r}, CCD line {look.ccd!r}, line {look.line:.6g}, sample {look.sample:.6g}"
                 self.keep_problem(reason, f"observation/tie: point {body.point!r} in {where}")
-        self.refusals += not used
+        if not used and waited:  # for a pose or for the choice: the message of now is of use
+            self.refused_later["observation/tie"] += 1
+        elif not used:
+            self.refusals += 1
 
     def _pose(self, body: Any, smoothed: bool, stamp_ns: int) -> list[Message]:
         if self._window is None:

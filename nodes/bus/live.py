@@ -205,6 +205,7 @@ class BusRunner:
             self._work(message)
         with self._lock:
             outputs = self._driver.finish()
+        self._count_refused_later()
         for output in outputs:
             self._publish(output)
         self._tell(force=True, state=STOPPING)
@@ -292,6 +293,7 @@ class BusRunner:
         last = self.node.last_problems
         if self.node.counters["failed"] > failed or self.node.refusals > refusals:
             self._check.counts[message.topic].refused += 1
+        self._count_refused_later()
         if self.node.counters["failed"] > failed:
             self._report(f"{self.node.name}: {last['failed']}")
         if self.node.counters["malformed"] > malformed == 0:
@@ -300,6 +302,12 @@ class BusRunner:
             self._publish(output)
         self._worked_ns = max(self._worked_ns, message.stamp_ns)
         self._busy_s += time.monotonic() - begun
+
+    def _count_refused_later(self) -> None:
+        """Count messages that had waited in the node where they belong, not with the one at which they were refused."""
+        for topic, number in self.node.refused_later.items():
+            self._check.counts[topic].refused += number
+        self.node.refused_later.clear()
 
     def _look_behind(self, received_ns: int) -> None:
         """Tell the node for how long its last message has waited and it has worked, and publish what it decides.

@@ -445,3 +445,26 @@ def test_another_project_in_flight_starts_the_window_again_and_live_orientation_
     assert node.counters["another local frame"] == (another == "origin_latitude")
     early = node.query("orientation", {"t": str(EPOCH + 10 * 10**9)})
     assert (early is None) == (another == "origin_latitude")  # in the frame before
+
+
+def test_a_tie_point_that_waited_for_a_pose_is_counted_when_it_is_refused(flight):
+    """The pose was counted in its place, and with one of several."""
+    messages = flight[1]
+    node = Adjuster(**SELDOM)
+    for topic in ("configuration/project", "configuration/camera", "configuration/strip"):
+        node.step(next(x for x in messages if x.topic == topic))
+    first = next(x for x in messages if x.topic == "observation/tie")
+    for name in ("a", "b"):
+        tie = m.TiePoint(point=name)
+        tie.images.add(strip=first.body.images[0].strip, ccd="none", line=5.0, sample=5.0)
+        node.step(replace(first, body=tie))
+    node.step(first)
+    assert not node.refusals and not node.refused_later
+    poses = (x for x in messages if x.topic == "trajectory/filtered")
+    for pose in poses:
+        node.step(pose)
+        if node.refused_later:
+            break
+    assert node.refused_later == {"observation/tie": 2} and not node.refusals
+    node.step(replace(first, body=tie))  # this one does not wait
+    assert node.refused_later == {"observation/tie": 2} and node.refusals == 1

@@ -103,3 +103,34 @@ def test_what_a_node_refuses_first_is_written_to_its_log():
         counts = runner._statistics()
     assert said == ["slow: sensor/attitude: no. 1 by design"]
     assert counts["sensor/attitude"].refused == 3 and "sensor/lines/N" not in counts  # which were of use
+
+
+class RefusesLater(Slow):
+    """Keeps image points until a pose comes, and can use none of them."""
+
+    held = 0
+
+    def step(self, message: Message):
+        self.held += message.topic == "observation/tie"
+        if message.topic == "trajectory/filtered":
+            self.refused_later["observation/tie"] += self.held
+            self.held = 0
+        return ()
+
+    def finish(self):
+        self.refused_later["observation/tie"] += self.held
+        return ()
+
+
+def test_what_waited_in_a_node_is_counted_where_it_belongs_when_it_is_refused():
+    """The pose was counted as refused, once, and of the image points none."""
+    with Bus(port=free_port(), source="slow") as bus:
+        runner = BusRunner(RefusesLater(), bus, lambda text: None)
+        for number in range(3):
+            runner._work(sample.message("observation/tie", number))
+        assert runner._statistics() == {}
+        runner._work(sample.message("trajectory/filtered", 3))
+        assert {topic: counted.refused for topic, counted in runner._statistics().items()} == {"observation/tie": 3}
+        runner._work(sample.message("observation/tie", 4))
+        runner._end()
+        assert runner._statistics()["observation/tie"].refused == 4
