@@ -74,9 +74,9 @@ def read_camera_instead(path: Path, camera: LineCamera, told: str = "", notes: l
     if not path.is_file():
         raise UserError(f"{path}: no such file, wanted a camera.json")
     found = read_camera(path, notes)
+    lenses = max(len(camera.lenses), len(found.lenses)) > 1
 
     def lines_of(c: LineCamera) -> dict[str, tuple[int, str]]:
-        lenses = len(camera.lenses) > 1 or len(c.lenses) > 1
         return {line.id: (line.pixels, line.lens if lenses else "") for line in c.lines}
 
     if lines_of(found) != lines_of(camera):

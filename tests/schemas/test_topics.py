@@ -166,3 +166,16 @@ def test_a_quaternion_beyond_all_bounds_is_refused():
     pose.pose.orientation.x = 1e300
     with pytest.raises(ValueError, match="quaternion of length 1e"):
         codec.validate(pose)
+
+
+@pytest.mark.parametrize("part", ["lenses", "lines"])
+def test_a_camera_without_a_lens_or_a_line_is_refused(part):
+    camera = m.Camera(name="c")
+    camera.lenses.add(id="L", focal_length_mm=60.0)
+    camera.lines.add(id="N", lens="L", x_mm=[0.0, 0.0], y_mm=[0.0, 0.1])
+    codec.validate(camera)
+    camera.ClearField(part)
+    with pytest.raises(
+        ValueError, match=f"camera 'c' with {int(part == 'lines')} lenses and {int(part == 'lenses')} CCD"
+    ):
+        codec.validate(camera)

@@ -11,8 +11,9 @@ from places import DATA
 from small_block import CAMERA
 
 from triline.nodes.cli import main
+from triline.nodes.convert import camera_from, camera_message
 from triline.nodes.errors import UserError
-from triline.nodes.formats.camera_json import read_camera, write_camera
+from triline.nodes.formats.camera_json import read_camera, read_camera_instead, write_camera
 from triline.nodes.formats.geocal_xml import read_glas_camera
 from triline.solver.camera.line_camera import CcdLine, Lens, LineCamera
 from triline.solver.camera.sensors import PRESETS, brown_distortion, preset
@@ -124,6 +125,29 @@ BAD = {
         lambda c: c["lines"][0].update(chips=[5, 3]),
         "camera.json: lines[0].chips: [5, 3], wanted the first sample",
     ),
+    "two lenses of one name": (
+        lambda c: c["lenses"].append(c["lenses"][0]),
+        "camera.json: lenses[1].id: 'L1', wanted an id that no other lens has",
+    ),
+    "distortion that is a number": (
+        lambda c: c["lenses"][0].update(distortion=1),
+        "camera.json: lenses[0].distortion: 1, wanted 5 numbers",
+    ),
+    "more pixels than any line has": (
+        lambda c: c["lines"][0].update(pixels=1_000_001),
+        "camera.json: lines[0].pixels: 1000001, wanted an integer of at least 2 and at most 1000000",
+    ),
+    "pixels without size": (
+        lambda c: c["lines"][0].update(pixel_size_mm=0.0),
+        "camera.json: lines[0].pixel_size_mm: 0.0, wanted a number above 0",
+    ),
+    **{
+        f"chips {chips!r}": (
+            lambda c, chips=chips: c["lines"][0].update(chips=chips),
+            f"camera.json: lines[0].chips: {chips!r}, wanted the first sample of each chip: 0, ..",
+        )
+        for chips in ([3, 5], [0, 5, 3], [0, 5, 5], [0, 1000], [0, 2.5], [False, 3], {"0": 3})
+    },
     "list of lines": (lambda c: c.update(lines={"id": 1}), "camera.json: lines: {'id': 1}, wanted a list"),
 }
 
@@ -223,3 +247,71 @@ def test_damaged_camera_archives(tmp_path):
     path.write_text(text.replace("3.52930124904383913e-01", "what"))
     with pytest.raises(UserError, match="'what', wanted a number"):
         read_glas_camera(path)
+
+
+def test_a_table_of_one_sample_is_refused(tmp_path):
+    path = _write(tmp_path, lambda c: c["lines"].__setitem__(0, {"id": "F", "table": "f.csv"}))
+    (tmp_path / "f.csv").write_text("sample,x_mm,y_mm\n0,1.0,-0.02\n")
+    with pytest.raises(UserError, match=r"f.csv: one sample, wanted at least 2"):
+        read_camera(path)
+
+
+def test_keys_that_are_not_known_are_named_and_those_that_a_table_replaces_are_not(tmp_path):
+    def change(camera):
+        camera["maker"] = "x"
+        camera["lenses"][0]["stop"] = 4
+        camera["lines"][0] |= {"table": "f.csv", "colour": "red"}
+        del camera["lines"][0]["pixels"]
+
+    (tmp_path / "f.csv").write_text("sample,x_mm,y_mm\n0,1.0,-0.02\n1,1.0,-0.01\n")
+    notes: list[str] = []
+    read_camera(_write(tmp_path, change), notes)
+    named = ("lenses[0].stop", "lines[0].colour", "maker")
+    assert notes == [f"camera.json: key {name} is not known and was ignored" for name in named]
+
+
+def test_a_camera_in_place_of_another_has_its_lines_in_its_order(tmp_path):
+    one = read_camera(_write(tmp_path))
+    other = read_camera_instead(_write(tmp_path, lambda c: c["lines"].reverse()), one)
+    assert [line.id for line in other.lines] == [line.id for line in one.lines] == ["F", "N"]
+    # the name of the only lens says nothing
+    renamed = _write(
+        tmp_path, lambda c: (c["lenses"][0].update(id="X"), [line.update(lens="X") for line in c["lines"]])
+    )
+    assert read_camera_instead(renamed, one).lines[0].lens == "X"
+
+    def second_lens(camera):
+        camera["lenses"].append(camera["lenses"][0] | {"id": "L2"})
+        camera["lines"][1]["lens"] = "L2"
+
+    for change, wanted in (
+        (lambda c: c["lines"].pop(), "F with 1000 pixels, N with 1000 pixels"),
+        (lambda c: c["lines"][0].update(pixels=999), "F with 1000 pixels, N with 1000 pixels"),
+        (second_lens, "F with 1000 pixels behind L1, N with 1000 pixels behind L1"),
+    ):
+        with pytest.raises(UserError, match=f"has other lines, wanted {wanted}"):
+            read_camera_instead(_write(tmp_path, change), one)
+    with pytest.raises(UserError, match=r"none.json: no such file, wanted a camera.json"):
+        read_camera_instead(tmp_path / "none.json", one)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda c: setattr(c.lenses[0], "focal_length_mm", 0.0), "lens 'L1' has focal length 0.0, wanted more than 0"),
+        (lambda c: c.lines[0].x_mm.pop(), "CCD line 'F' has no usable table"),
+        (
+            lambda c: (c.lines[1].x_mm.__delitem__(slice(1, None)), c.lines[1].y_mm.__delitem__(slice(1, None))),
+            "line 'N'",
+        ),
+        (lambda c: c.lines[0].y_mm.__setitem__(3, float("nan")), "CCD line 'F' has no usable table"),
+        (lambda c: setattr(c.lines[0], "lens", "X"), "CCD line 'F' names lens 'X'; known lenses"),
+        (lambda c: setattr(c.lines[0], "id", "N"), "two CCD lines of a camera have the same id"),
+    ],
+)
+def test_a_camera_message_that_is_no_camera_is_refused(tmp_path, change, told):
+    body = camera_message(read_camera(_write(tmp_path)))
+    assert [line.id for line in camera_from(body).lines] == ["F", "N"]
+    change(body)
+    with pytest.raises(ValueError, match=told):
+        camera_from(body)
