@@ -17,6 +17,7 @@ from ..recording.remote import RemotePath, path_of
 from ..recording.seal import verify
 from ..recording.seal_place import seal_of
 from ..recording.summary import findings
+from .damage import look_again
 
 EXAMPLE = """triline check flight.mcap
   triline check flight.mcap --authority survey      # signed in the name of one of its bundles, and not altered"""
@@ -43,6 +44,7 @@ def run(args: argparse.Namespace) -> int:
             f"{args.recording}: seals of recordings elsewhere are not looked at, wanted a file for --authority"
         )
     reader = RecordingReader(args.recording)
+    look_again(reader)
     found = findings(reader)
     authority = args.authority / CERTIFICATE if args.authority and args.authority.is_dir() else args.authority
     seal = None if reader.remote is not None else verify(args.recording, authority)

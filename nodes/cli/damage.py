@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import sys
+import time
 
 from ..convert import iso
 from ..recording.reader import RecordingReader
 from ..recording.summary import left_out_lines
+
+#: A recorder that lives has written something more after so long, s: twice `recorder.FLUSH_S`, what it waits at most.
+_LOOK_AGAIN_S = 0.6
+
+
+def look_again(reader: RecordingReader) -> None:
+    """Wait until it shows whether a file without an end is being written; one with an end is not waited for."""
+    if not reader.complete and reader.remote is None and not reader.grows:
+        time.sleep(_LOOK_AGAIN_S)
 
 
 def tell_damage(command: str, reader: RecordingReader) -> None:

@@ -15,6 +15,7 @@ from ..recording.remote import path_of
 from ..recording.seal_place import seal_of
 from ..recording.summary import findings, holdings, platforms
 from ..terminal import plain
+from .damage import look_again
 
 EXAMPLE = "triline info flight.mcap"
 
@@ -42,6 +43,7 @@ def _signed(recording: Path) -> dict[str, Any] | None:
 
 def _summary(recording: Recording) -> dict[str, Any]:
     reader = recording.reader
+    look_again(reader)
     held = holdings(reader)
     span, rows = held.span_ns, held.topics
     present = {row.topic for row in rows if row.messages}  # a damaged file can name a channel whose messages are lost

@@ -16,6 +16,7 @@ from ..recording.index import Channel
 from ..recording.reader import RecordingReader
 from ..recording.summary import topic_summaries
 from ..recording.writer import RecordingWriter
+from .damage import look_again
 
 EXAMPLE = """triline recover broken.mcap -o whole.mcap
   triline recover flight.mcap flight_0001.mcap -o whole.mcap    # a recorder that began a new file in flight"""
@@ -46,6 +47,9 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"{args.output}: cannot be written: {(error.strerror or str(error)).lower()}") from None
     finally:
         part.unlink(missing_ok=True)
+    for reader in readers:
+        look_again(reader)
+    grow = [str(reader.path) for reader in readers if reader.grows and not reader.complete]
     damage = [(reader, damage) for reader in readers for damage in reader.damage]
     several = len(readers) > 1
     result = {
@@ -58,6 +62,7 @@ def run(args: argparse.Namespace) -> int:
         "lost_bytes": sum(d.length for _, d in damage),
         "damage": [f"{reader.path}: {d}" if several else str(d) for reader, d in damage],
         "complete": all(reader.complete for reader in readers),
+        "being_written": grow,
         "missing": missing,
     }
     print(json_text(result) if args.json else "\n".join(_lines(result)))
@@ -118,6 +123,8 @@ def _lines(r: dict[str, Any]) -> list[str]:
         lines.append("the file had no end; no whole chunk was lost")
     else:
         lines.append("nothing was lost")
+    for path in r["being_written"]:
+        lines.append(f"{path} grows: it is being written, and what comes from now on is left out")
     if r["missing"]:
         lines.append("missing by their numbers: " + ", ".join(f"{n} of {topic}" for topic, n in r["missing"].items()))
     if r["foreign_messages"]:

@@ -19,10 +19,12 @@ from ...schemas.topics import Family
 from .. import registry
 from ..bus.pacing import SETTLE_S, Pacer
 from ..bus.program import ProgramOptions
+from ..convert import iso
 from ..errors import UserError
 from ..node import Message
 from ..recording.reader import RecordingReader
 from ..recording.runner import active_nodes, is_remade
+from ..recording.summary import time_span_ns
 from ..voices import FIXED, VERDICT, RecordedVoices
 
 SECOND_NS = 1_000_000_000
@@ -118,8 +120,12 @@ def play(
     head, told = _holding(reader, before, body)
     if not len(head) and not len(body):
         raise UserError(f"{reader.path}: nothing to play")
+    if from_ns is not None and to_ns is not None and from_ns > to_ns:
+        raise UserError(f"{reader.path}: the time asked for begins {iso(from_ns)} and ends {iso(to_ns)}, before that")
     if not len(body) and (loop or from_ns is not None or to_ns is not None):
-        raise UserError(f"{reader.path}: nothing but configuration in the time asked for")
+        span = time_span_ns(reader)
+        of = "" if span is None else f"; it is of {iso(span[0])} to {iso(span[1])} ({(span[1] - span[0]) / 1e9:.1f} s)"
+        raise UserError(f"{reader.path}: nothing but configuration in the time asked for{of}")
     stamps, channel_of = reader.index.stamp_ns[body], reader.index.channel
     strips = _Strips(head, [reader.raw(int(n)) for n in body if reader.channels[int(channel_of[n])].topic == STRIP])
     span_ns = int(stamps.max()) - min(int(stamps.min()), strips.begin_ns) + LOOP_PAUSE_NS if len(body) else 0

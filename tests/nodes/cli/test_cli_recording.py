@@ -24,12 +24,13 @@ from recording_file import write_recording
 
 import triline
 from triline.nodes.bus.session import Bus
-from triline.nodes.cli import main
+from triline.nodes.cli import damage, main
 from triline.nodes.cli.replay import _nobody
 from triline.nodes.convert import iso
 from triline.nodes.errors import UserError
 from triline.nodes.node import Message, Node
 from triline.nodes.player.player import play, time_argument
+from triline.nodes.recorder.recorder import FLUSH_S
 from triline.nodes.recording.reader import RecordingReader
 from triline.nodes.recording.runner import active_nodes, process
 from triline.nodes.recording.writer import RecordingWriter
@@ -77,6 +78,26 @@ def test_a_recording_without_an_end_may_be_one_that_is_being_written(capsys, fli
     growing.write_bytes(flight.read_bytes()[: -len(b"\x89MCAP0\r\n")])
     out = run(capsys, "info", growing)[1]
     assert "the file has no end: it is being written, was cut off, or its writer was killed" in out
+
+
+@pytest.mark.parametrize("word", ["check", "info", "recover"])
+def test_a_file_without_an_end_is_looked_at_again(capsys, flight, tmp_path, monkeypatch, word):
+    """Recorders write several times a second: `recover` of a flight that goes on said that nothing was lost."""
+    data = flight.read_bytes()
+    growing = tmp_path / "growing.mcap"
+    growing.write_bytes(data[:-30])
+    waited = []
+
+    def go_on(seconds):
+        waited.append(seconds)
+        growing.write_bytes(data[:-20])
+
+    monkeypatch.setattr(damage.time, "sleep", go_on)
+    options = ["-o", tmp_path / "out.mcap"] if word == "recover" else []
+    _, out, err = run(capsys, word, growing, *options)
+    assert "grows: it is being written" in out + err and len(waited) == 1 and waited[0] > FLUSH_S
+    _, out, err = run(capsys, word, flight, *options)
+    assert "grows" not in out + err and len(waited) == 1
 
 
 def test_a_view_of_a_recording_without_a_whole_message_tells_the_damage(capsys, flight, tmp_path):
