@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -345,15 +346,20 @@ def join_inputs(blocks: Sequence[BlockData], paths: Sequence[Path]) -> JoinedBlo
     ------
     UserError : recordings that cannot be joined
     """
+    if len({os.path.realpath(str(path)) for path in paths}) < len(paths):
+        raise UserError("a recording is given twice")
     names = [path.stem for path in paths]
     if len(set(names)) < len(names):
         names = [str(path) for path in paths]
-    if len(set(names)) < len(names):
-        raise UserError("a recording is given twice")
     try:
         joined = join_blocks(blocks, names)
     except ValueError as error:
         raise UserError(str(error)) from None
+    for one, other, number in joined.repeated:
+        raise UserError(
+            f"{other} holds {number} of the image points of {one}, which would count twice: is it the same flight, "
+            "as recorded and as processed? (of parts of a flight `triline recover` makes one recording)"
+        )
     notes = joining_notes(joined, names)
     return replace(joined, block=replace(joined.block, notes=(*notes, *joined.block.notes)))
 

@@ -42,6 +42,7 @@ class JoinedBlock:
     elsewhere : tie points whose name comes again at another place, and were kept apart
     restated : known points of which a later recording states other sigmas, as (point, recording that counts); the first
         that has the point counts
+    repeated : pairs of recordings that hold the same measurements, which would count twice, and how many of them
     """
 
     block: BlockData
@@ -53,6 +54,7 @@ class JoinedBlock:
     renamed: tuple[tuple[str, str, str], ...]
     elsewhere: int
     restated: tuple[tuple[str, str], ...] = ()
+    repeated: tuple[tuple[str, str, int], ...] = ()
 
 
 def join_blocks(blocks: Sequence[BlockData], names: Sequence[str]) -> JoinedBlock:
@@ -106,7 +108,25 @@ def join_blocks(blocks: Sequence[BlockData], names: Sequence[str]) -> JoinedBloc
         renamed,
         elsewhere,
         restated,
+        _repeated(blocks, names),
     )
+
+
+def _repeated(blocks: Sequence[BlockData], names: Sequence[str]) -> tuple[tuple[str, str, int], ...]:
+    """Recordings that hold image points of the same name, line, sample and time."""
+    codes: dict[str, int] = {}
+    parts = []
+    for i, block in enumerate(blocks):
+        code = np.array([codes.setdefault(id, len(codes)) for id in block.point_ids], dtype=float)
+        image = block.image
+        microseconds = np.round(1e6 * image.time_s)
+        columns = [np.full(len(image), i), microseconds, image.sample, image.line, image.ccd, code[image.point]]
+        parts.append(np.stack(columns)[:, np.isfinite(microseconds)])
+    looks = np.concatenate(parts, axis=1)
+    looks = looks[:, np.lexsort(looks)]
+    same = (looks[1:, 1:] == looks[1:, :-1]).all(axis=0) & (looks[0, 1:] != looks[0, :-1])
+    pairs = Counter(zip(looks[0, :-1][same].astype(int).tolist(), looks[0, 1:][same].astype(int).tolist(), strict=True))
+    return tuple((names[a], names[b], number) for (a, b), number in sorted(pairs.items()))
 
 
 def _same_camera(a: BlockData, b: BlockData) -> bool:

@@ -1,12 +1,14 @@
 """Several recordings as one block: what is joined, what is kept apart, and the same answers as of one recording."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from adjustment_networks import CAMERA
 
-from triline.nodes.cli.adjust import joining_notes
+from triline.nodes.cli.adjust import join_inputs, joining_notes
+from triline.nodes.errors import UserError
 from triline.solver.adjustment.adjustment import adjust
 from triline.solver.adjustment.block_data import BlockData, ImagePoints, KnownPoints, network_from_block
 from triline.solver.adjustment.covariance import cofactors
@@ -176,3 +178,30 @@ def test_each_recording_keeps_its_apriori_sigmas(block):
     moved = {strip.id: np.abs(mixed.state.theta[set_.columns][:3]).max() for set_, strip in
              zip(mixed.layout.sets, joined.strips, strict=True)}  # fmt: skip
     assert max(moved["S3"], moved["C1"]) < 0.1 * max(moved["S1"], moved["S2"])
+
+
+def test_measurements_that_two_recordings_hold_are_told(block):
+    """A flight as recorded and as processed: all counted twice, and sigma0 was 0.63 where it should be 1."""
+    one, other = some_strips(block, [0, 1]), some_strips(block, [2])
+    ids = {id: i for i, id in enumerate(reversed(block.point_ids))}
+    place = np.array([ids[id] for id in block.point_ids])
+    again = some_strips(block, [0, 3])  # S1 once more, its points in another order and its times from another moment
+    again = replace(again, point_ids=tuple(ids), image=replace(again.image, point=place[again.image.point]))
+    names = ["a", "b", "c"]
+    number = int((block.image.strip == 0).sum())
+    assert join_blocks([one, other, later(again, 64)], names).repeated == (("a", "c", number),)
+    assert join_blocks([one, other, some_strips(block, [3])], names).repeated == ()
+    for name in ("line", "sample", "time_s"):  # of another flight
+        changed = replace(again, image=replace(again.image, **{name: getattr(again.image, name) + 1e-3}))
+        assert join_blocks([one, changed], ["a", "b"]).repeated == ()
+    with pytest.raises(UserError, match=rf"b holds {number} of the image points of a, which would count twice"):
+        join_inputs([one, again], [Path("a.mcap"), Path("b.mcap")])
+
+
+def test_a_recording_is_given_twice_whatever_way_leads_to_it(block, tmp_path):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "a.mcap").write_bytes(b"x")
+    (tmp_path / "b.mcap").symlink_to(tmp_path / "a.mcap")
+    for other in ("sub/../a.mcap", "b.mcap"):
+        with pytest.raises(UserError, match="a recording is given twice"):
+            join_inputs([block, block], [tmp_path / "a.mcap", tmp_path / other])
