@@ -223,6 +223,17 @@ class Flight:
         return text
 
 
+def _instead_of_flight(folder: Path) -> str:
+    """What is to be done about a folder without a flight, or what lies in it."""
+    recordings = sorted(path.name for path in folder.glob("*.mcap"))
+    if recordings:
+        many = f", {len(recordings)} recordings" if len(recordings) > 1 else ""
+        return f", but {recordings[0]}{many}: a recording is given itself"
+    if (folder / "result.json").is_file():
+        return ", but result.json: it holds results of a command"
+    return f"; `triline new flight {shlex.quote(str(folder))}` writes one"
+
+
 def read_flight(folder: Path, live: bool | None = None, instead: Instead | None = None) -> Flight:
     """A flight folder with all that is wrong in it among its ``problems``.
 
@@ -242,7 +253,7 @@ def read_flight(folder: Path, live: bool | None = None, instead: Instead | None 
     if not path.is_file():
         if folder.is_file():
             raise UserError(f"{folder}: is a file, wanted a folder with {FILE}")
-        raise UserError(f"{folder}: no {FILE}; `triline new flight {shlex.quote(str(folder))}` writes one")
+        raise UserError(f"{folder}: no {FILE}{_instead_of_flight(folder)}")
     file = read_toml(path)
     flight = Flight(folder, options=others.options)
     tables: dict[str, Keys] = {}

@@ -26,6 +26,7 @@ from ....solver.orbit.motion import Motion
 from ....solver.orbit.time_scales import tai_from_day
 from ...errors import UserError
 from ..keys import Keys, read_json
+from ..other_kinds import other_kind
 from .scene import GAP_STEPS, SAME_VELOCITY_M_S, SatelliteScene, ellipsoid_of, stated_velocity, velocity_misfit
 
 Array = NDArray[np.floating]
@@ -49,6 +50,8 @@ def read_isd(path: Path) -> SatelliteScene:
         raise UserError(
             f"{path}: orientation of a frame camera, which `triline locate` and `rectify --sensor` take; wanted a scene"
         )
+    if not file.has("name_model") and (other := other_kind(path)):
+        raise UserError(f"{path}: {other}; wanted a scene")
     model = file.text("name_model")
     if model != _LINE_SCANNER:
         raise file.refuse("name_model", _LINE_SCANNER)

@@ -63,3 +63,31 @@ def test_what_is_for_another_command_is_named_with_that_command(tmp_path, capsys
         err = capsys.readouterr().err
         assert f"triline {command}: {name}: " in err and said in err and err.count("\n") == 1, err
         assert ("wanted a recording" in err) == (command != "import")
+
+
+@pytest.mark.parametrize("command", ["check", "fly"])
+def test_a_folder_without_a_flight_is_named_by_what_lies_in_it(tmp_path, capsys, monkeypatch, command):
+    """A folder of recordings was to get a flight.toml."""
+    monkeypatch.chdir(tmp_path)
+    assert main([command, "."]) == 1
+    assert "no flight.toml; `triline new flight .` writes one" in capsys.readouterr().err
+    (tmp_path / "result.json").write_text("{}")
+    assert main([command, "."]) == 1
+    assert "no flight.toml, but result.json: it holds results" in capsys.readouterr().err
+    for name, said in (
+        ("b", "no flight.toml, but b.mcap: a recording is given itself"),
+        ("a", "a.mcap, 2 recordings:"),
+    ):
+        (tmp_path / f"{name}.mcap").write_bytes(b"")
+        assert main([command, "."]) == 1
+        assert said in capsys.readouterr().err
+
+
+def test_locate_names_a_camera_as_what_it_is(tmp_path, capsys, monkeypatch):
+    """It said that its name_model was missing."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "camera.json").write_text(CAMERA)
+    (tmp_path / "p.csv").write_text("column,row,height_m\n1,1,0\n")
+    assert main(["locate", "camera.json", "--pixels", "p.csv", "-o", "out.csv"]) == 1
+    err = capsys.readouterr().err
+    assert "camera.json: a line camera (camera.json), which lies in" in err and "wanted a scene" in err
