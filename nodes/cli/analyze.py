@@ -15,6 +15,8 @@ from ..recording.remote import path_of
 from ..recording.summary import Holdings
 from ..report.accuracy_table import accuracy_lines
 
+#: Ends of names of what a page is not.
+_NO_PAGE = (".pdf", ".docx", ".odt", ".json", ".csv", ".png", ".mcap")
 EXAMPLE = "triline analyze flight.mcap -o report.html"
 
 
@@ -35,6 +37,8 @@ def write_report(recording: Path, output: Path) -> dict[str, Any]:
     if not recording.exists():
         raise UserError(f"{recording}: no such file or folder")
     refuse_importable(recording)
+    if output.suffix.lower() in _NO_PAGE:
+        raise UserError(f"{output}: the report is a page, wanted {output.with_suffix('.html')}, which browsers print")
     from ..report.analysis import analyse
     from ..report.page import page
     from ..report.source import read

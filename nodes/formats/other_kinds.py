@@ -14,6 +14,14 @@ _SETTINGS = {
     "project.toml": "settings of a block folder",
     "platform.toml": "settings of a sensor folder",
 }
+#: How compressed files begin -> their name.
+_PACKED = {
+    b"\x1f\x8b": "gzip",
+    b"PK\x03\x04": "ZIP",
+    b"\x28\xb5\x2f\xfd": "Zstandard",
+    b"\xfd7zXZ\0": "xz",
+    b"7z\xbc\xaf\x27\x1c": "7-Zip",
+}
 
 
 def other_kind(path: Path) -> str | None:
@@ -23,6 +31,9 @@ def other_kind(path: Path) -> str | None:
     with open(path, "rb") as file:
         head = file.read(_HEAD)
     suffix, name = path.suffix.lower(), path.name
+    for begin, packed in _PACKED.items():
+        if head.startswith(begin):
+            return f"packed ({packed}), which has to be unpacked first"
     if is_frame_json(path):
         return "orientation of a frame camera's image, which `triline rectify --sensor` and `triline locate` read"
     if suffix in (".json", ".isd") or head.lstrip().startswith(b"{"):

@@ -88,7 +88,7 @@ def _local(text: str, out: Path) -> Iterator[tuple[str, str, int, str]]:
     if path.is_file():
         chosen, base = [path], path.parent
     elif path.is_dir():
-        below = sorted(path.rglob("*" + RECORDING))
+        below = sorted(each for each in path.rglob("*") if each.suffix.lower() == RECORDING)
         chosen, base = [p for p in below if p.name != PROCESSED or not record_of(p.parent, "process").exists()], path
     elif _PATTERN.search(text):
         chosen = [p for p in map(Path, sorted(glob.glob(text, recursive=True))) if p.is_file()]

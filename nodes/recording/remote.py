@@ -104,7 +104,7 @@ def listed(url: str, ending: str) -> tuple[str, list[tuple[str, int, str]]]:
             rows = fs.glob(key, detail=True)
         elif (found := fs.info(key))["type"] == "directory":
             base, rows = key.rstrip("/"), fs.find(key, detail=True)
-            rows = {name: row for name, row in rows.items() if name.endswith(ending)}
+            rows = {name: row for name, row in rows.items() if name.lower().endswith(ending)}
         else:
             base, rows = key.rpartition("/")[0], {found["name"]: found}
         protocol, _, rest = url.partition("://")

@@ -39,6 +39,8 @@ FILES = {
     "map.geojson": ('{"type": "FeatureCollection"}', "GeoJSON, which"),
     "a_RPC.TXT": ("LINE_OFF: +001.0 pixels\n", "rational polynomials of a satellite scene, which `triline locate`"),
     "dim.xml": ('<?xml version="1.0"?><Dimap_Document/>', "metadata of a satellite scene, which `triline locate`"),
+    "flight.mcap.gz": ("\x1f\x8b", "packed (gzip), which has to be unpacked first"),
+    "flight.zip": ("PK\x03\x04", "packed (ZIP), which has to be unpacked first"),
     "flight.toml": ("[flight]\n", "settings of a flight folder, which is given as a whole"),
 }
 
@@ -58,7 +60,7 @@ def test_what_is_for_another_command_is_named_with_that_command(tmp_path, capsys
         "export": ["--points", "out.csv"],
     }
     for name, (text, said) in FILES.items():
-        (tmp_path / name).write_text(text)
+        (tmp_path / name).write_text(text, encoding="latin-1")
         assert main([command, name, *options.get(command, [])]) == 1
         err = capsys.readouterr().err
         assert f"triline {command}: {name}: " in err and said in err and err.count("\n") == 1, err

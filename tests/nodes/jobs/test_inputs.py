@@ -103,6 +103,13 @@ def test_names_of_a_store_lead_nowhere_else(season):
     assert found == ["a_b_", "plain", "x/__/__/__/etc/evil"]
 
 
+def test_a_recording_with_its_ending_in_capitals_is_taken(season):
+    """Memory cards have such names; a folder was done without it, and nothing said so."""
+    Path("s/day1/LAST.MCAP").write_bytes(b"x")
+    assert names("s") == ["day1/LAST", "day1/flight", "day2/flight", "first"]
+    assert "day1/LAST" in names(f"file://{season}/s")
+
+
 def test_names_that_are_alike_stay_and_are_apart(season):
     """Parentheses, as browsers put them behind a name, became underscores."""
     for name in ("s/a-1.mcap", "s/a_1.mcap", "s/a 1.mcap", "s/a (1).mcap"):

@@ -83,6 +83,13 @@ def test_values_that_cannot_be_are_not_called_damage_of_the_recording(messages, 
     assert result["damage"] == [] and said in result["not_used"][-1]
 
 
+def test_a_page_is_not_written_under_the_name_of_something_else(recording, tmp_path, capsys):
+    """A file .pdf held the page, and viewers called it damaged."""
+    assert main(["analyze", str(recording), "-o", str(tmp_path / "r.PDF")]) == 1
+    assert f"the report is a page, wanted {tmp_path / 'r.html'}" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_nothing_but_configuration_is_said_to_be_too_little(messages, tmp_path, capsys):
     kept = [x for x in messages if x.topic.startswith(("configuration/", "observation/control"))]
     path = write_recording(tmp_path / "head.mcap", kept)
