@@ -30,6 +30,9 @@ EARLY_S = 900.0
 #: Attitudes that have not changed in any digit for so long, s, are those of a sensor that hangs (tuned: sensors that
 #: round to 0.01 deg repeat themselves for some samples).
 FROZEN_S = 1.0
+#: Fixes that lie so far from the origin of the project, km over ground, are told: no block is as large, the project is
+#: that of another place, or latitude and longitude are exchanged.
+FAR_KM = 500.0
 #: Largest correction of GNSS times on an operator's word, s.
 LARGEST_CORRECTION_S = 100.0
 #: Numbers of fixes that are missing without time going on: the clock was set back.
@@ -318,6 +321,7 @@ class Navigator(Node):
             return []
         self._check_time(message)
         frame = self._frame
+        self._tell_far(body.latitude, body.longitude)
         antenna_l = frame.from_geodetic(*geodetic)
         R_l_enu = frame.R_ln_at(geodetic[0], geodetic[1]) @ R_ENU_NED
         time_s = self._seconds(self._time_ns(body))
@@ -330,6 +334,21 @@ class Navigator(Node):
         if isinstance(self._engine, KinematicFilter):
             return self._engine.add_gnss(time_s, antenna_l, covariance_l)
         return self._engine.add_fix(fix)
+
+    def _tell_far(self, latitude: float, longitude: float) -> None:
+        """Tell an operator when fixes are where the project is not: whatever is computed of them is nonsense."""
+        away_km = _ground_km(self._frame, latitude, longitude) if self._frame.is_placed else 0.0
+        if away_km < FAR_KM:
+            self.alarms.pop("far", None)
+            return
+        text = (
+            f"GNSS is {away_km:.0f} km away from the origin of the project ({self._frame.lat_deg:.4f}, "
+            f"{self._frame.lon_deg:.4f}), at {latitude:.4f}, {longitude:.4f}: is the project that of another flight?"
+        )
+        if "far" not in self.alarms:
+            self._notes.append(self._log(self._stamp_ns, text, warning=True))
+            self.problem("far from project", f"sensor/gnss: {text}")
+            self.alarms["far"] = text
 
     def _in_step(self, fix: GnssData) -> bool:
         """Whether motion says that a fix has the time of the other sensors, as far as motion has shown it."""
@@ -397,3 +416,11 @@ class Navigator(Node):
 
     def _log(self, time_ns: int, text: str, warning: bool = False) -> Message:
         return Message("event/log", self._stamp_ns, convert.log_line(self.name, text, time_ns, warning))
+
+
+def _ground_km(frame: LocalFrame, latitude: float, longitude: float) -> float:
+    """Distance of a place from the origin of a frame along the ground of a round Earth, km."""
+    a, b = np.radians([frame.lat_deg, latitude])
+    turn = np.radians(longitude - frame.lon_deg)
+    cosine = np.sin(a) * np.sin(b) + np.cos(a) * np.cos(b) * np.cos(turn)
+    return float(6371.0 * np.arccos(np.clip(cosine, -1.0, 1.0)))

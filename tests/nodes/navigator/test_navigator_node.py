@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -61,6 +63,39 @@ def test_same_messages_same_bytes(sensors):
         for _ in range(2)
     )
     assert first == second
+
+
+def test_fixes_far_from_the_project_are_told_once(sensors):
+    """Of a flight with the project of another place (or latitude and longitude exchanged) nothing was said."""
+
+    def exchanged(message):
+        if message.topic != "sensor/gnss":
+            return message
+        body = type(message.body)()
+        body.CopyFrom(message.body)
+        body.latitude, body.longitude = message.body.longitude, message.body.latitude
+        return replace(message, body=body)
+
+    node = Navigator()
+    out = run(node, map(exchanged, sensors))
+    (said,) = (o.body for o in out if o.topic == "event/log" and "away from the origin" in o.body.message)
+    assert said.message.startswith("GNSS is 5") and said.message.endswith("that of another flight?")
+    assert node.alarms["far"] == said.message and node.counters["far from project"] == 1
+    right = next(x for x in sensors if x.topic == "sensor/gnss")
+    node.step(replace(right, stamp_ns=sensors[-1].stamp_ns))
+    assert "far" not in node.alarms
+
+
+def test_a_project_without_a_place_has_no_fix_far_from_it(sensors):
+    node = Navigator()
+    for message in sensors:
+        if message.topic == "configuration/project":
+            body = type(message.body)()
+            body.CopyFrom(message.body)
+            body.origin_latitude = body.origin_longitude = body.origin_height = 0.0
+            message = replace(message, body=body)
+        node.step(message)
+    assert "far" not in node.alarms
 
 
 def bad_attitudes():
