@@ -316,7 +316,10 @@ def _header(path: Path, columns: Sequence[Column], notes: list[str]) -> list[str
 
 def separator_hint(header: Sequence[str]) -> str:
     """What may be wrong with a header in which a column is missing; "" where that is nothing else."""
-    return "; is the separator a comma?" if len(header) == 1 and any(c in header[0] for c in "\t ") else ""
+    if len(header) == 1:
+        return "; is the separator a comma?" if any(c in header[0] for c in "\t ") else ""
+    capitals = all(name.isupper() for name in header)
+    return f"; capital letters count: {header[0]} stands there" if capitals else ""
 
 
 def _names(columns: Sequence[Column]) -> str:

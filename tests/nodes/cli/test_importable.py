@@ -93,3 +93,12 @@ def test_locate_names_a_camera_as_what_it_is(tmp_path, capsys, monkeypatch):
     assert main(["locate", "camera.json", "--pixels", "p.csv", "-o", "out.csv"]) == 1
     err = capsys.readouterr().err
     assert "camera.json: a line camera (camera.json), which lies in" in err and "wanted a scene" in err
+
+
+def test_a_header_in_capital_letters_is_told(tmp_path, capsys, monkeypatch):
+    """TIME_S stood there, and time_s was missing."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "poses.csv").write_text(POSES.replace(POSES[: POSES.index("\n")], POSES[: POSES.index("\n")].upper()))
+    assert main(["import", "poses.csv", "-o", "out.mcap"]) == 1
+    err = capsys.readouterr().err
+    assert "poses.csv:1: time_s: column missing" in err and "; capital letters count: TIME_S stands there" in err
