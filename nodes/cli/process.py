@@ -119,6 +119,8 @@ def run(args: argparse.Namespace) -> int:
             raise lacking(reader, f"nothing to process for {args.nodes}: {held_topics(reader)}")
         if not summary.outputs:
             raise lacking(reader, f"nothing came out: {_waiting(summary)}")
+        if NAVIGATOR in summary.nodes and not summary.outputs.keys() & set(POSES):
+            notes.append(f"no trajectory came out, so nothing is oriented: {_no_trajectory(summary)}")
         os.replace(part, args.output)
     except OSError as error:
         raise UserError(f"{args.output}: cannot be written: {(error.strerror or str(error)).lower()}") from None
@@ -184,6 +186,15 @@ def _camera(reader: RecordingReader, path: Path, notes: list[str]) -> bytes:
     if body is None:
         raise lacking(reader, f"no {CAMERA} in it, so --camera has nothing to stand for")
     return codec.encode(camera_message(read_camera_instead(path, camera_from(body), notes=notes)))
+
+
+def _no_trajectory(summary: ProcessSummary) -> str:
+    """Why the navigator made none, as far as can be told."""
+    sensors = ("sensor/gnss",), ("sensor/attitude", "sensor/imu")
+    lacking = [" or ".join(names) for names in sensors if not any(summary.inputs.get(name) for name in names)]
+    if lacking:
+        return f"no usable message on {', and none on '.join(lacking)}"
+    return summary.problems.get(NAVIGATOR) or f"{NAVIGATOR} {summary.states[NAVIGATOR]}"
 
 
 def _waiting(summary: ProcessSummary) -> str:

@@ -1,12 +1,15 @@
 """A node of `triline process` whose work fails at a message: what came out is not told as whole."""
 
 import json
+from dataclasses import replace
 
 import pytest
 from places import ROOT
 
 from triline.nodes.cli import main
 from triline.nodes.navigator.navigator import Navigator
+from triline.nodes.recording.reader import RecordingReader
+from triline.nodes.recording.writer import RecordingWriter
 
 
 @pytest.fixture
@@ -41,3 +44,29 @@ def test_it_is_told_at_what_and_how_often(failing, options, tmp_path, capsys):
         result = json.loads(told.out)
         assert list(result["failed"]) == ["navigator"] and result["counters"]["navigator"]["failed"] == 2
         assert result["problems"]["navigator"] == "another problem"
+
+
+@pytest.mark.parametrize(
+    ("topic", "field", "said"),
+    [
+        ("sensor/gnss", "altitude", "no usable message on sensor/gnss"),
+        ("sensor/attitude", "roll", "no usable message on sensor/attitude or sensor/imu"),
+        ("sensor/gnss", "position_covariance", "sensor/gnss: position covariance: wanted 9 values with a positive dia"),
+    ],
+)
+def test_a_flight_without_a_trajectory_is_told_with_the_reason(topic, field, said, tmp_path, capsys):
+    """It was done like any other, and that nothing was oriented had to be found out from the counts of topics."""
+    flight, out = tmp_path / "flight.mcap", tmp_path / "out.mcap"
+    with RecordingWriter(flight) as writer:
+        for message in RecordingReader(ROOT / "recordings" / "strip.mcap").sorted_messages():
+            if message.topic == topic:
+                body = type(message.body)()
+                body.CopyFrom(message.body)
+                if field == "position_covariance":
+                    body.position_covariance[:] = [0.0] * 9
+                else:
+                    setattr(body, field, float("nan"))
+                message = replace(message, body=body)
+            writer.write(message)
+    assert main(["process", str(flight), "-o", str(out), "-q"]) == 0
+    assert f"note: no trajectory came out, so nothing is oriented: {said}" in capsys.readouterr().out
