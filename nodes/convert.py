@@ -256,7 +256,7 @@ def _square(values: Any, n: int, name: str) -> list[float] | None:
         return None
     if len(values) != n * n:
         raise ValueError(f"{name} has {len(values)} values, wanted {n * n}")
-    numbers = list(values)
+    numbers = values[:]  # `list` takes twice as long
     # a sum of large numbers may be infinite where none of them is
     if not (math.isfinite(sum(numbers)) or all(map(math.isfinite, numbers))) or min(numbers[:: n + 1]) < 0:
         raise ValueError(f"{name} is not finite or has a negative variance")

@@ -147,7 +147,7 @@ def _is_fine(body: Any) -> bool:
         if values:
             if size and len(values) != size:
                 return False
-            total += sum(values)
+            total += sum(values[:])  # a list of them takes half as long as the field itself
     for get in numbers.messages:
         for part in get(body):
             if not _is_fine(part):

@@ -132,18 +132,19 @@ class Recording:
         """
         if topics.find(self._check(topic)).type is not m.PoseInFrame:
             raise UserError(f"{self.reader.path}: {topic} carries {topics.find(topic).type_name}, not poses")
-        samples = [convert.pose_sample(message.body) for message in self.reader.in_frame(self.messages(topic))]
-        n = len(samples)
-        none = np.full((6, 6), np.nan)
-        quaternion = np.array([s.quaternion for s in samples]).reshape(n, 4)
+        bodies = [message.body for message in self.reader.in_frame(self.messages(topic))]
+        poses = [convert.plain_pose(body) for body in bodies]  # arrays are made of all at once
+        n = len(poses)
+        none = [np.nan] * 36
+        quaternion = np.array([pose.quaternion for pose in poses]).reshape(n, 4)
         return PoseTable(
-            time_ns=np.array([s.time_ns for s in samples], dtype=np.int64),
-            position_l=np.array([s.position_l for s in samples]).reshape(n, 3),
+            time_ns=np.array([pose.time_ns for pose in poses], dtype=np.int64),
+            position_l=np.array([pose.position_l for pose in poses]).reshape(n, 3),
             quaternion=quaternion,
             angles=convert.angles_of(quaternion).reshape(n, 3) if n else np.empty((0, 3)),
-            covariance=np.array([none if s.covariance is None else s.covariance for s in samples]).reshape(n, 6, 6),
-            valid=np.array([s.valid for s in samples], dtype=bool),
-            strip=np.array([s.strip for s in samples], dtype=object),
+            covariance=np.array([pose.covariance or none for pose in poses]).reshape(n, 6, 6),
+            valid=np.array([pose.valid for pose in poses], dtype=bool),
+            strip=np.array([body.strip for body in bodies], dtype=object),
         )
 
     def camera(self) -> LineCamera:
