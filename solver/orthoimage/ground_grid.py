@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ Array = NDArray[np.floating]
 TOLERANCE_CELLS, NODES = 2e-3, 5
 #: A grid of heights has no more nodes than this.
 MOST_NODES = 50_000_000
+#: Nodes of it that are computed at once. Tuned: fewer take longer, more no less.
+AT_ONCE = 20_000
 
 
 @dataclass(frozen=True)
@@ -109,13 +111,20 @@ class GroundGrid:
 def _polynomial(exactly: Callable[[Array], Array], low: Array, high: Array) -> tuple[Callable[[Array], Array], float]:
     """A polynomial for a function of places (n, 3) between two corners (3,), and how far it is off at most."""
     middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1.0)
-    x, y, z = np.meshgrid(*[np.linspace(-1, 1, n) for n in (NODES, NODES, 3)], indexing="ij")
-    nodes = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
-    wanted, design = exactly(middle + half * nodes), _basis(nodes)
+    nodes, design = _nodes()
+    wanted = exactly(middle + half * nodes)
     offset = wanted.mean(axis=0)
     coefficients, *_ = np.linalg.lstsq(design, wanted - offset, rcond=None)
     off = float(np.abs(design @ coefficients - (wanted - offset)).max())
     return lambda at: _basis((at - middle) / half) @ coefficients + offset, off
+
+
+@cache
+def _nodes() -> tuple[Array, Array]:
+    """Places (n, 3) between -1 and 1 that the polynomial is fitted to, and its terms there."""
+    x, y, z = np.meshgrid(*[np.linspace(-1, 1, n) for n in (NODES, NODES, 3)], indexing="ij")
+    nodes = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+    return nodes, _basis(nodes)
 
 
 def _basis(s: Array) -> Array:
@@ -181,13 +190,15 @@ def heights_in_frame(
     start_m = float(np.median(corners[:, 2]))
     field = np.empty((ny, nx))
     x_l = left + step_m * np.arange(nx)
-    for i in range(ny):
-        point = np.stack([x_l, np.full(nx, bottom + step_m * i), np.full(nx, start_m)], axis=1)
+    some = max(AT_ONCE // nx, 1)
+    for i in range(0, ny, some):
+        y_l = bottom + step_m * np.arange(i, min(i + some, ny))
+        point = np.stack([*(v.ravel() for v in np.meshgrid(x_l, y_l)), np.full(nx * len(y_l), start_m)], axis=1)
         for _ in range(3):  # the place in the CRS hardly depends on the height
             place = other.to_crs(point, may_lie_outside=True)  # the field reaches beyond the given heights
             x = other.near(place[:, 0], x0 + 0.5 * dx * (columns - 1))  # across the date line, or from 0 to 360
             h = given.height((x - x0) / dx, (place[:, 1] - y0) / dy)
             known = np.isfinite(h)
             point[:, 2] += np.where(known, unit_m * (h - place[:, 2]), 0.0)
-            field[i] = np.where(known, point[:, 2], np.nan)
+        field[i : i + some] = np.where(known, point[:, 2], np.nan).reshape(len(y_l), nx)
     return HeightField(float(left), float(bottom), step_m, field)

@@ -262,13 +262,16 @@ class StripRectifier:
         take the memory and the time of the others."""
         lines = np.concatenate([self._cells[-NEWEST:], cells])
         newest = lines.reshape(-1, 2)
+        at_hand = MOST_AWAY * (self.rays.pixels + len(self._usable) + len(cells))
+        if float((np.fmax.reduce(newest) - np.fmin.reduce(newest)).max()) <= at_hand:
+            return  # as nearly always: none is that far from any other
         newest = newest[np.isfinite(newest).all(axis=1)]
         if len(newest):
             step = np.hypot(*np.moveaxis(np.diff(lines, axis=1), 2, 0)) / np.diff(self.rays.sample)
             cells_a_pixel = float(np.median(step[np.isfinite(step)])) if np.isfinite(step).any() else 1.0
             away = np.abs(cells - np.median(newest, axis=0)).max(axis=2)
             with np.errstate(invalid="ignore"):
-                far = away > MOST_AWAY * max(cells_a_pixel, 1.0) * (self.rays.pixels + len(self._usable) + len(cells))
+                far = away > max(cells_a_pixel, 1.0) * at_hand
             self.missed += int(far.sum())
             cells[far] = np.nan
 
