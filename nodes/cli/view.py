@@ -164,7 +164,7 @@ def show(messages, canvas, truth: bool = True) -> Counter[str]:
     """Draw messages, in the order of their stamps, and close the canvas; returns how many of each topic were used."""
     from ..viewer import scene
 
-    picture = scene.Scene(canvas)
+    picture = scene.Scene(canvas, recorded=True)
     hidden = frozenset(() if truth else scene.TRUTH_TOPICS)
     counts: Counter[str] = Counter()
     next_ns = 0

@@ -27,6 +27,8 @@ _SCALE = np.array([1.0, 1.0, 1.0, _MDEG, _MDEG, _MDEG])
 _STEP_NS = int(0.2 * convert.SECOND_NS)
 _ALPHA = 0.05
 _WAITING = 1000
+#: Values of a curve of a recording that are handed over together. Tuned: with fewer a piece costs more than its values.
+TOGETHER = 1000
 _GAP_S, _UPDATES, _RAYS_GAP_S = 1.5, 3.0, 6.0  # a curve is broken after so long without a pose, so many updates, rays
 _MOST_LIMITS = 10.0  # in the overview protection levels end at so many alert limits
 _TELLING = 30  # redundancy from which sigma0 says something
@@ -212,11 +214,12 @@ class PlotsPart(Part):
     # ---- drawing
 
     def draw(self, canvas: Canvas) -> None:
+        least = TOGETHER if self.state.recorded and not self.state.closing else 1
         for entity, (times, values) in self._curves.items():
             if entity not in self._styled:
                 self._styled.add(entity)
                 canvas.style(f"plots/{entity}", self._styles[entity])
-            if times:
+            if len(times) >= least:
                 canvas.curve(f"plots/{entity}", times, values)
                 self._curves[entity] = [], []
         for t, text, level in self._events:

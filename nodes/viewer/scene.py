@@ -66,11 +66,18 @@ _NO_NAVIGATOR_NS = 30 * convert.SECOND_NS
 
 
 class Scene:
-    """Takes messages one by one and draws what has changed when told to."""
+    """Takes messages one by one and draws what has changed when told to.
 
-    def __init__(self, canvas: Canvas) -> None:
+    Parameters
+    ----------
+    canvas : what is drawn on
+    recorded : as in `SceneState`
+    """
+
+    def __init__(self, canvas: Canvas, recorded: bool = False) -> None:
         self.canvas = canvas
         self.state = SceneState()
+        self.state.recorded = recorded
         self.parts = (
             FlightPart(self.state),
             PointsPart(self.state),

@@ -71,6 +71,7 @@ class SceneState:
     start_ns : stamp of the first message that is not latched; None before it
     now_s : newest stamp, seconds since then
     closing : whether this is the last drawing
+    recorded : whether all is drawn before anybody looks, so that curves may come in few pieces
     project, camera, frame, strips : configuration, as far as it has come; strip : id of the newest strip
     origin : (3,) subtracted from local coordinates for display; decided by the first pose
     extent : strip id -> (2, 3) first and last place of the perspective centre, as planned
@@ -88,7 +89,7 @@ class SceneState:
     def __init__(self) -> None:
         self.start_ns: int | None = None
         self.now_s = 0.0
-        self.closing = False
+        self.closing = self.recorded = False
         self.project: Any = None
         self.camera: LineCamera | None = None
         self.frame: LocalFrame | None = None

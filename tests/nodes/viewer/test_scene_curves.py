@@ -11,6 +11,7 @@ from triline.nodes import convert
 from triline.nodes.cli.view import show
 from triline.nodes.node import Message
 from triline.nodes.viewer.rerun_canvas import _corrections, _overview, viewpoint
+from triline.nodes.viewer.scene import Scene
 from triline.schemas import messages as m
 
 WINDOW_S = 9.0
@@ -84,6 +85,25 @@ def test_curves_are_not_drawn_across_a_turn(notes):
     assert checked > 30
     assert set(np.array(notes.curves["plots/overview/integrity/limit"][1])[:10]) == {2.5}
     assert set(np.array(notes.curves["plots/overview/integrity/ground"][1])[:10]) == {0.9}
+
+
+def test_curves_of_a_recording_come_in_few_pieces_and_with_all_that_a_live_scene_draws(strip):
+    drawn, pieces = [], []
+    for recorded in (False, True):
+        canvas = Notebook()
+        calls, curve = [], canvas.curve
+        canvas.curve = lambda *words, calls=calls, curve=curve: (calls.append(words), curve(*words))
+        scene = Scene(canvas, recorded)
+        for message in strip:
+            scene.take(message)
+            scene.draw()
+        scene.close()
+        drawn.append(canvas.curves)
+        pieces.append(len(calls))
+    assert drawn[0].keys() == drawn[1].keys()
+    for entity, curves in drawn[0].items():
+        np.testing.assert_array_equal(curves, drawn[1][entity], entity)
+    assert pieces[1] == len(drawn[1]) < 0.1 * pieces[0]
 
 
 def test_deviations_are_not_joined_from_strip_to_strip(notes):
