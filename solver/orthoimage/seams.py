@@ -171,9 +171,12 @@ def feather_weights(labels: IntArray, known: Mask, width: int) -> NDArray[np.flo
             continue
         weight = np.asarray(uniform_filter(mine.astype(np.float32), size=width, mode="nearest"))
         weight = np.where(weight < 1e-4, np.float32(0.0), weight)
-        if not there.all():
-            inside = np.asarray(distance_transform_edt(there), dtype=np.float32)
-            weight *= np.minimum(inside / np.float32(width), np.float32(1.0))
+        if not weight.any():
+            continue
+        near = _around(weight > 0, width)  # an edge further off takes no weight
+        if not there[near].all():
+            inside = np.asarray(distance_transform_edt(there[near]), dtype=np.float32)
+            weight[near] *= np.minimum(inside / np.float32(width), np.float32(1.0))
         out[k] = np.where(there, weight, 0.0)
     total = out.sum(axis=0)
     # where nothing has a weight (a label that is not known there) the first that is known counts
@@ -183,6 +186,12 @@ def feather_weights(labels: IntArray, known: Mask, width: int) -> NDArray[np.flo
         out[(first[bare], *np.nonzero(bare))] = 1.0
         total = out.sum(axis=0)
     return (out / np.where(total > 0, total, 1.0)).astype(np.float32)
+
+
+def _around(some: Mask, cells: int) -> tuple[slice, slice]:
+    """Rows and columns of the rectangle that some cells, and so many on each side of them, lie in."""
+    row, column = np.flatnonzero(some.any(axis=1)), np.flatnonzero(some.any(axis=0))
+    return slice(max(row[0] - cells, 0), row[-1] + cells + 1), slice(max(column[0] - cells, 0), column[-1] + cells + 1)
 
 
 @dataclass(frozen=True)

@@ -85,6 +85,15 @@ def test_feathering_is_a_ramp_and_ends_at_edges():
     np.testing.assert_array_equal(hard[0] == 1, labels == 0)
 
 
+def test_a_lone_cell_of_an_orthoimage_has_no_weight_in_a_wide_transition():
+    known = np.ones((2, 40, 60), dtype=bool)
+    known[1, 30:] = False
+    labels = np.zeros((40, 60), dtype=int)
+    labels[5, 7] = 1
+    weight = seams.feather_weights(labels, known, 150)  # a share of 1 / 150^2 of the cells around it
+    assert (weight[0] == 1).all() and (weight[1] == 0).all()
+
+
 def test_lines_end_where_three_meet_and_borders_belong_to_one_tile():
     labels = np.array([[0, 0, 1, 1], [0, 0, 1, 1], [2, 2, 2, 2]])
     assert sorted(line.labels for line in seams.seam_lines(labels)) == [(0, 1), (0, 2), (1, 2)]
