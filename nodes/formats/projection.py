@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -85,6 +85,12 @@ def missing_grids(crs: str) -> list[str]:
     ------
     CrsError : as of `known_crs`
     """
+    return list(_missing_grids(crs))
+
+
+@cache
+def _missing_grids(crs: str) -> tuple[str, ...]:
+    """The same; PROJ takes half a second for heights of some countries, and which grids there are stays as it is."""
     from pyproj.transformer import TransformerGroup
 
     known = known_crs(crs)
@@ -92,8 +98,8 @@ def missing_grids(crs: str) -> list[str]:
         warnings.simplefilter("ignore")
         group = TransformerGroup(known if len(known.axis_info) == 3 else known.to_3d(), "EPSG:4979", always_xy=True)
     if group.best_available:
-        return []
-    return sorted({g.short_name for way in group.unavailable_operations for g in way.grids if not g.available})
+        return ()
+    return tuple(sorted({g.short_name for way in group.unavailable_operations for g in way.grids if not g.available}))
 
 
 def off_without_grids(crs: str) -> str:
@@ -105,6 +111,7 @@ def off_without_grids(crs: str) -> str:
     return ", ".join(parts)
 
 
+@cache
 def unknown_heights(crs: str) -> str:
     """Name of the vertical part of a CRS, if PROJ knows no way from it to the ellipsoid, whatever grids there are.
 
