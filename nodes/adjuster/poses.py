@@ -159,13 +159,12 @@ class PoseBuffer:
         return _matrix(covariance) if newest_s >= time_s else None
 
     @property
-    def learning(self) -> tuple[bool, bool]:
-        """Whether position, and attitude, of the newest smoothed pose are clearly more certain than when filtered."""
+    def learning(self) -> bool:
+        """Whether the newest smoothed pose is clearly more certain than the newest filtered one."""
         if len(self._latest) < 2:
-            return False, False
+            return False
         smoothed, filtered = (np.array(self._latest[key][1][::7]) for key in (True, False))
-        learnt = smoothed < (1.0 - LEARNT_SHARE) * filtered
-        return bool(learnt[:3].any()), bool(learnt[3:].any())
+        return bool((smoothed < (1.0 - LEARNT_SHARE) * filtered).any())
 
     @property
     def leading(self) -> tuple[float, Array] | None:

@@ -187,7 +187,7 @@ class AdjustedStrips:
         too: while GNSS is out, after the navigator has started again, be that when the strip is over but not final."""
         another, left_out_s = self.poses.started_anew(), -np.inf
         anew = window.slow
-        if another and (any(self.poses.learning) or anew.grown(covariance) is not anew):
+        if another and (self.poses.learning or anew.grown(covariance) is not anew):
             anew = anew.with_taken_back()
         for id, (first, now) in list(self._stated.items()):
             strip = window.strips[id]

@@ -114,7 +114,7 @@ class SlowErrors:
         b = np.array([damping_rate(time_s) for time_s in self.wander_times_s.tolist()])
         return 4.0 * b**3 * np.square([*self.wander_m, *self.wander])
 
-    def widened(self, covariance: Array, learning: tuple[bool, bool] = (False, False)) -> SlowErrors:
+    def widened(self, covariance: Array, learning: bool = False) -> SlowErrors:
         """With what the covariance (6, 6) of a pose at the start of a strip says more; no sigma becomes smaller.
 
         A filter's error at one time is an error for long: its excess is a constant over the strip. It may all be gone
@@ -126,13 +126,12 @@ class SlowErrors:
 
         Parameters
         ----------
-        learning : whether the filter still learns positions, and attitudes, whatever its covariance: the wander of the
-            attitude is as fast as that where it learns it; one that measures its attitude learns positions alone
+        learning : the filter still learns, whatever its covariance: the attitude's wander is as fast as that
         """
         variance = np.diagonal(np.asarray(covariance, dtype=float))
         told = np.concatenate([self.position_sigma, self.attitude_sigma]) ** 2
         excess = np.where(variance > VARIANCE_EXCEEDS * told, variance - told, 0.0)
-        if not (excess.any() or any(learning)):
+        if not (excess.any() or learning):
             return self
 
         def more(sigma: Three, part: Array, share: float = 1.0) -> Three:
@@ -149,7 +148,7 @@ class SlowErrors:
             wander_m,
             more(self.wander, rad, WANDERING_SHARE),
             position_s,
-            self._learnt_s if rad.any() or learning[1] else inertial.attitude_time_s,
+            self._learnt_s,
         )
 
     def with_taken_back(self) -> SlowErrors:
@@ -177,8 +176,9 @@ class SlowErrors:
             return self
         a, b, c = np.sqrt(np.square(self.wander) + excess[3:]).tolist()
         wander_m, position_s = joined(self.wander_m, self.wander_time_s, excess[:3], LEARNING_TIME_S)
-        attitude_s = self._learnt_s if excess[3:].any() else float(self.wander_times_s[3])
-        return replace(self, wander_m=wander_m, wander=(a, b, c), wander_time_s=position_s, attitude_time_s=attitude_s)
+        return replace(
+            self, wander_m=wander_m, wander=(a, b, c), wander_time_s=position_s, attitude_time_s=self._learnt_s
+        )
 
     def differs(self, other: SlowErrors) -> bool:
         """Whether another wander is clearly larger, or so much smaller that a new one has begun."""

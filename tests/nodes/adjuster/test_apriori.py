@@ -9,7 +9,6 @@ import pytest
 
 from triline.nodes import convert
 from triline.nodes.adjuster.adjuster import Adjuster
-from triline.nodes.adjuster.poses import PoseBuffer
 from triline.nodes.config import build
 from triline.nodes.errors import UserError
 from triline.nodes.navigator.navigator import Navigator
@@ -50,25 +49,8 @@ def test_a_less_certain_pose_makes_its_components_less_certain_and_none_more():
 
 
 def test_a_filter_that_still_learns_has_faster_errors():
-    slow = TOLD.widened(covariance(), (True, True))
+    slow = TOLD.widened(covariance(), learning=True)
     assert slow.wander_time_s < TOLD.wander_time_s and slow.shift == TOLD.shift and slow.offset_m == TOLD.offset_m
-    assert slow.attitude_time_s < slow.wander_time_s
-
-
-def test_a_filter_that_learns_positions_alone_measures_its_attitude():
-    """As where a system of its own gives the attitude. Its errors were taken for as fast as those that a filter learns:
-    points were 8 % worse than they can be, with sigmas 25 % too large (motion of a real flight)."""
-    for slow in (
-        TOLD.widened(covariance(), (True, False)), TOLD.widened(covariance(3.0)), TOLD.grown(covariance(3.0)),
-    ):  # fmt: skip
-        assert slow.wander_times_s[3] == TOLD.wander_time_s > slow.wander_time_s
-        assert slow.wander == TOLD.wander
-    poses, P = PoseBuffer(), np.diag(covariance(3.0, 1.0)).copy()
-    for smoothed in (False, True):
-        P[:3] *= 0.5 if smoothed else 1.0
-        pose = convert.PlainPose(0, [0.0] * 3, [0.0] * 4, np.diag(P).ravel().tolist(), True)
-        poses.add(10.0, pose, smoothed, "")
-    assert poses.learning == (True, False)
 
 
 def test_what_is_left_of_a_covariance_is_one():
