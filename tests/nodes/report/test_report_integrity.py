@@ -204,7 +204,7 @@ def test_coordinates_of_a_control_point_are_refused_one_by_one():
     assert look.key == rejected_key(m.RejectedObservation(point="P1", strip="S1", ccd="F", line=10.0, sample=20.0))
     flight = collect(flight_messages(seconds=12.0, points=20))
     flight.rejected = refused
-    text = page(flight, analyse(flight, Holdings("x.mcap", 0, 0, None, [], [])))
+    text = page(flight, analyse(flight, Holdings("x.mcap", 0, 0, None, [], [], [])))
     html = text[text.index("<h2>Rejected observations</h2>") :]
     html = html[: html.index("</section>")]
     assert html.count("GCP1") == 2 and ">X<" in html and ">Z<" in html and "0.00" not in html
