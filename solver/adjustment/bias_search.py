@@ -102,9 +102,9 @@ def _telling(C: Array, out: Bools) -> Bools:
     """
     out, own = out.copy(), np.flatnonzero(out)
     left = C[np.ix_(own, own)]
-    whole = np.diagonal(left).copy()
+    nothing = UNTOLD * float(np.diagonal(left).max(initial=0.0))  # a look straight down says little of a height at all
     for k, place in enumerate(own.tolist()):
-        if left[k, k] <= UNTOLD * whole[k]:
+        if left[k, k] <= nothing:
             out[place] = False
         else:
             left = left - np.outer(left[:, k], left[k]) / left[k, k]
