@@ -55,7 +55,7 @@ def of_seed(grade: str, seed: int, strip_s: float, strips: int) -> list[tuple[Sl
             next_s = first_s[len(stated)] if len(stated) < strips else np.inf
             covariance = poses.covariance_after(next_s - NEAR_START_S)
             if (m.stamp_ns - EPOCH) * 1e-9 >= next_s and covariance is not None:
-                stated.append(slow.widened(covariance, poses.learning))
+                stated.append(slow.widened(covariance, poses.learnt))
 
     for message in Simulator(simulation).messages(EPOCH):
         if message.topic == "configuration/project":

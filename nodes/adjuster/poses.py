@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...solver.camera.line_camera import LineCamera, finest_pixel
 from ...solver.geometry.trajectory import Trajectory
-from ...solver.models.slow_errors import LEARNT_SHARE, LEAST_NOISE, SlowErrors
+from ...solver.models.slow_errors import LEARNT_SHARE, LEAST_NOISE, NOTHING_LEARNT, SlowErrors
 from .. import convert
 
 Array = NDArray[np.floating]
@@ -159,12 +159,12 @@ class PoseBuffer:
         return _matrix(covariance) if newest_s >= time_s else None
 
     @property
-    def learning(self) -> bool:
-        """Whether the newest smoothed pose is clearly more certain than the newest filtered one."""
+    def learnt(self) -> Sequence[bool]:
+        """(6,) in which components the newest smoothed pose is clearly more certain than the newest filtered one."""
         if len(self._latest) < 2:
-            return False
+            return NOTHING_LEARNT
         smoothed, filtered = (np.array(self._latest[key][1][::7]) for key in (True, False))
-        return bool((smoothed < (1.0 - LEARNT_SHARE) * filtered).any())
+        return (smoothed < (1.0 - LEARNT_SHARE) * filtered).tolist()
 
     @property
     def leading(self) -> tuple[float, Array] | None:

@@ -87,7 +87,7 @@ class AdjustedStrips:
         if self._by_poses and body.id not in window.strips:
             covariance = self.poses.covariance_after(first_s - NEAR_START_S)
             if covariance is not None:
-                slow = slow.widened(covariance, self.poses.learning)
+                slow = slow.widened(covariance, self.poses.learnt)
             elif not body.ended:
                 self._held[body.id] = body
                 return
@@ -187,7 +187,7 @@ class AdjustedStrips:
         too: while GNSS is out, after the navigator has started again, be that when the strip is over but not final."""
         another, left_out_s = self.poses.started_anew(), -np.inf
         anew = window.slow
-        if another and (self.poses.learning or anew.grown(covariance) is not anew):
+        if another and (any(self.poses.learnt) or anew.grown(covariance) is not anew):
             anew = anew.with_taken_back()
         for id, (first, now) in list(self._stated.items()):
             strip = window.strips[id]

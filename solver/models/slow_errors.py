@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,8 @@ from .gauss_markov import autocorrelation, damping_rate
 Array = NDArray[np.floating]
 Three = tuple[float, float, float]
 _NONE: Three = (0.0, 0.0, 0.0)
+#: Of the components of an orientation, those that a filter learns.
+NOTHING_LEARNT = (False,) * 6
 
 #: A pose variance more than this many times what was said beforehand is clearly larger.
 VARIANCE_EXCEEDS = 1.5
@@ -77,6 +80,11 @@ class SlowErrors:
         return np.repeat([self.wander_time_s, self.attitude_time_s or self.wander_time_s], 3)
 
     @property
+    def is_learnt(self) -> bool:
+        """Whether its fastest wander is nearer to what a filter learns than to what is stated."""
+        return float(self.wander_times_s.min()) < 2.0 * LEARNING_TIME_S
+
+    @property
     def alike(self) -> SlowErrors:
         """With one correlation time, the shorter one: for models that have no other."""
         return replace(self, wander_time_s=float(self.wander_times_s.min()), attitude_time_s=0.0)
@@ -114,7 +122,7 @@ class SlowErrors:
         b = np.array([damping_rate(time_s) for time_s in self.wander_times_s.tolist()])
         return 4.0 * b**3 * np.square([*self.wander_m, *self.wander])
 
-    def widened(self, covariance: Array, learning: bool = False) -> SlowErrors:
+    def widened(self, covariance: Array, learnt: Sequence[bool] = NOTHING_LEARNT) -> SlowErrors:
         """With what the covariance (6, 6) of a pose at the start of a strip says more; no sigma becomes smaller.
 
         A filter's error at one time is an error for long: its excess is a constant over the strip. It may all be gone
@@ -126,15 +134,13 @@ class SlowErrors:
 
         Parameters
         ----------
-        learning : the filter still learns, whatever its covariance: the attitude's wander is as fast as that. Also if
-            positions alone are learnt, beside a system that measures the attitude: at its stated correlation time
-            points of flights as stated are 1 % better (8 % where views are a minute apart), those of an attitude that
-            swings by 0.02 deg in 10 s a quarter worse (settings `rtk` of `triline study misspecified`)
+        learnt : (6,) which components the filter still learns, whatever its covariance. Where it learns the attitude,
+            too, that wanders as fast as it learns; an attitude that is measured wanders as stated
         """
         variance = np.diagonal(np.asarray(covariance, dtype=float))
         told = np.concatenate([self.position_sigma, self.attitude_sigma]) ** 2
         excess = np.where(variance > VARIANCE_EXCEEDS * told, variance - told, 0.0)
-        if not (excess.any() or learning):
+        if not (excess.any() or any(learnt)):
             return self
 
         def more(sigma: Three, part: Array, share: float = 1.0) -> Three:
@@ -151,7 +157,7 @@ class SlowErrors:
             wander_m,
             more(self.wander, rad, WANDERING_SHARE),
             position_s,
-            self._learnt_s,
+            self._learnt_s if rad.any() or any(learnt[3:]) else inertial.attitude_time_s,
         )
 
     def with_taken_back(self) -> SlowErrors:
@@ -179,9 +185,8 @@ class SlowErrors:
             return self
         a, b, c = np.sqrt(np.square(self.wander) + excess[3:]).tolist()
         wander_m, position_s = joined(self.wander_m, self.wander_time_s, excess[:3], LEARNING_TIME_S)
-        return replace(
-            self, wander_m=wander_m, wander=(a, b, c), wander_time_s=position_s, attitude_time_s=self._learnt_s
-        )
+        attitude_s = self._learnt_s if excess[3:].any() else float(self.wander_times_s[3])
+        return replace(self, wander_m=wander_m, wander=(a, b, c), wander_time_s=position_s, attitude_time_s=attitude_s)
 
     def differs(self, other: SlowErrors) -> bool:
         """Whether another wander is clearly larger, or so much smaller that a new one has begun."""

@@ -124,9 +124,10 @@ class Wander(CorrectionModel):
         self._sigma = np.tile(np.maximum(np.concatenate([slow.wander_m, slow.wander]), NOTHING), (segments + 1, 1))
         self._time_s = np.tile(slow.wander_times_s, (segments + 1, 1))
         self._another = np.zeros(segments + 1, dtype=bool)
+        self._attitude_at_most_s = np.inf
         self.used = self._spaced(0, self._sigma[0], self._time_s[0])
         self._grouped()
-        self._observations = self._stated()
+        self._observations = self._stated(self._times_s())
 
     def design(self, time_s: ArrayLike) -> Design:
         return self._design(*self._located(time_s))[0]
@@ -166,7 +167,7 @@ class Wander(CorrectionModel):
 
     def _left_out(self, begin: IntArray, end: IntArray, inside: Array, variance: Array | None = None) -> Array:
         if variance is None:
-            variance, _ = self._between(inside, self._time_s[end, self._first], end - begin)
+            variance, _ = self._between(inside, self._times_s()[end, self._first], end - begin)
         part = inside / (self.step_s * (end - begin))
         jump = np.minimum(np.maximum(part * (1.0 - part), 0.0), 0.25)  # where a wander becomes another is unknown
         g, components = self._group, np.arange(6)
@@ -208,12 +209,30 @@ class Wander(CorrectionModel):
         self._sigma[first:] = sigma
         self._time_s[first:] = time_s
         self._another[first] = another
+        self._state_anew()
+        return float(self.borders[first])
+
+    def hurry_attitude(self, at_most_s: float) -> None:
+        """Take the attitude's correlation time for no longer than so many seconds, inf for as stated; the arrays that
+        `pseudo_observations` gave change, and borders in use stay."""
+        self._attitude_at_most_s = at_most_s
+        self._state_anew()
+
+    def if_attitude_hurried(self, at_most_s: float) -> PseudoObservations:
+        """What `pseudo_observations` would be after `hurry_attitude`."""
+        return self._stated(self._times_s(at_most_s))
+
+    def _state_anew(self) -> None:
         self._grouped()
-        changed = self._stated()
+        changed = self._stated(self._times_s())
         self._observations.columns[...] = changed.columns
         self._observations.coefficients[...] = changed.coefficients
         self._observations.sigma[...] = changed.sigma
-        return float(self.borders[first])
+
+    def _times_s(self, attitude_at_most_s: float | None = None) -> Array:
+        """(segments + 1, 6) correlation times that hold."""
+        at_most_s = self._attitude_at_most_s if attitude_at_most_s is None else attitude_at_most_s
+        return np.minimum(self._time_s, np.repeat([np.inf, at_most_s], 3))
 
     def _spaced(self, first: int, sigma: Array, time_s: Array) -> list[IntArray]:
         """Borders in use of each component from one to the last, as far apart as a wander (6,), (6,) allows."""
@@ -225,20 +244,21 @@ class Wander(CorrectionModel):
             lengths[out * sigma <= allowed] = longer
         return [np.append(np.arange(first, last, length), last) for length in lengths.tolist()]
 
-    def _alike(self) -> list[IntArray]:
-        """Components by the borders they use and their correlation times."""
+    def _alike(self, times_s: Array) -> list[IntArray]:
+        """Components by the borders they use and their correlation times (segments + 1, 6)."""
         found: dict[bytes, list[int]] = {}
         stated = self.options.slow.wander_times_s
-        for component, (used, time_s) in enumerate(zip(self.used, self._time_s.T, strict=True)):
+        for component, (used, time_s) in enumerate(zip(self.used, times_s.T, strict=True)):
             found.setdefault(used.tobytes() + stated[component].tobytes() + time_s.tobytes(), []).append(component)
         return [np.array(components) for components in found.values()]
 
     def _grouped(self) -> None:
         """Look up what depends on the groups of `_alike` only."""
-        alike = self._alike()
+        times_s = self._times_s()
+        alike = self._alike(times_s)
         self._first = np.array([components[0] for components in alike])
         self._use = [self.used[component] for component in self._first]
-        self._as_stated = bool((self._time_s == self.options.slow.wander_times_s).all())
+        self._as_stated = bool((times_s == self.options.slow.wander_times_s).all())
         self._group = np.empty(6, dtype=np.int64)
         # (k, 6) columns of a time's coefficients, of its two borders as if both were the first one
         self._column = np.full((2 + 4 * len(alike), 6), -1, dtype=np.int32)
@@ -280,19 +300,19 @@ class Wander(CorrectionModel):
     def pseudo_observations(self) -> PseudoObservations:
         return self._observations
 
-    def _stated(self) -> PseudoObservations:
+    def _stated(self, times_s: Array) -> PseudoObservations:
         slow = self.options.slow
         sigma = np.concatenate([slow.offset_m, slow.shift, slow.drift])
         start = GLOBALS + np.arange(12)
-        slope_sigma = self._sigma[0] * _damping_rates(self._time_s[0])
+        slope_sigma = self._sigma[0] * _damping_rates(times_s[0])
         direct = direct_observations(
             np.concatenate([np.maximum(sigma, NOTHING), self._sigma[0], slope_sigma]),
             self.unknown_names[: GLOBALS + 12],
         )
         assert (direct.columns[GLOBALS:, 0] == start).all()
-        return join_observations([direct, self._transitions()])
+        return join_observations([direct, self._transitions(times_s)])
 
-    def _transitions(self) -> PseudoObservations:
+    def _transitions(self, times_s: Array) -> PseudoObservations:
         """Two whitened observations ``G (z_k+1 - F D z_k) = 0`` of every component and segment, ``G Q G^T = I``.
 
         ``D`` makes an error that grows larger. Where sigma falls, the value at the next border is a new one. There are
@@ -301,16 +321,16 @@ class Wander(CorrectionModel):
         n = len(self.borders) - 1
         coefficients, sigma = np.zeros((n, 6, 2, 4)), np.full((n, 6), np.inf)
         before = np.repeat(np.arange(n)[:, None], 6, axis=1)
-        for c in self._alike():
+        for c in self._alike(times_s):
             begin, end = self.used[c[0]][:-1], self.used[c[0]][1:]
             before[np.ix_(end - 1, c)] = begin[:, None]
             sigma[np.ix_(end - 1, c)] = self._sigma[np.ix_(end, c)]
-            times = self._time_s[:, c[0]]
+            times = times_s[:, c[0]]
             for time_s, length in {*zip(times[end].tolist(), (end - begin).tolist(), strict=True)}:
                 chosen = (times[end] == time_s) & (end - begin == length)
                 a, b = begin[chosen], end[chosen]
                 F, Q, P0 = second_order_gauss_markov(1.0, time_s, self.step_s * length)
-                G, new = np.linalg.inv(np.linalg.cholesky(Q)), np.linalg.inv(np.linalg.cholesky(P0))
+                G, new = (np.tril(np.linalg.inv(np.linalg.cholesky(of))) for of in (Q, P0))
                 ratio = (self._sigma[b] / self._sigma[a])[:, c]
                 rate = np.sqrt(P0[1, 1]) / _damping_rates(times[a])
                 D = np.zeros((*ratio.shape, 2, 2))

@@ -208,7 +208,7 @@ class Window:
             return
         self.strips[id] = WindowStrip(
             id, first_line_time_s, line_rate_hz, lines, slow or self.slow, self.options, self.state, joined_s,
-            self.network.sigmas.apriori, self.network.platform,
+            self.network.sigmas.apriori, self.network.sigmas.attitude_at_most_s, self.network.platform,
         )  # fmt: skip
         self._block.begin(self.strips[id])
 

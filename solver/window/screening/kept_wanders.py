@@ -25,6 +25,11 @@ class KeptWanders:
         self._largest, self._other_then = np.ones(2), np.ones(2)
         self._equations_then, self._first_s = np.zeros(2), np.full(2, np.inf)
 
+    def another_attitude(self) -> None:
+        """Of the attitude another wander is stated: what the one before was found to be says nothing."""
+        self._largest[1] = self._other_then[1] = 1.0
+        self._equations_then[1], self._first_s[1] = 0.0, np.inf
+
     def keeps(self, factor: Array, equations: IntArray, final_to_s: float) -> tuple[bool, bool]:
         """Whether what is present keeps its largest factors; asked each time sigmas are stated anew, and remembered.
 

@@ -8,25 +8,33 @@ Source: K.-R. Koch, Maximum likelihood estimate of variance components, Bulletin
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import get_lapack_funcs
 
 from ...arrays import Array
+from ...models.base import WANDERS
 from ..results import DivergedError
 from ..state.strip import WindowStrip
 from ..state.unknowns import WindowState, block_of
 
 (_trtrs,) = get_lapack_funcs(("trtrs",), dtype=float)  # pyrefly: ignore[not-iterable]
 
-#: Factors that are weighed against each other, and how far from 1 they usually are, as a logarithm. Tuned.
-BANK, USUAL_LOG = (1.0, 1.5, 2.3, 3.5, 5.5, 9.0, 15.0, 30.0, 60.0), 1.5
+#: Factors that are weighed against each other, and how far from 1 they usually are, as a logarithm. Tuned: with 1.5 one
+#: of three attitudes that swing 20 km above the ground is taken for a position of some metres, since images tell them
+#: apart by little there (7.7 m in place of 5.8 m); with 1.0 one flight of two with a step of the GNSS is 14 % worse.
+BANK, USUAL_LOG = (1.0, 1.5, 2.3, 3.5, 5.5, 9.0, 15.0, 30.0, 60.0, 120.0), 1.2
 #: How far those of a strip usually are from what earlier strips have shown, as a logarithm. Tuned.
 FROM_STRIP_TO_STRIP_LOG = 0.4
 #: Before a wander is stated larger it is weighed against noise of looks that is so many times as large. Tuned.
 NOISES = (1.0, 1.2, 1.45, 1.75, 2.1, 2.6, 3.2, 4.0, 5.0)
 #: The steps from a choice of factors to its neighbours.
-STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+STEPS = tuple(tuple(step) for step in np.concatenate([np.eye(4, dtype=int), -np.eye(4, dtype=int)]).tolist())
+#: The shortest correlation time of the attitude is stated that has so much of the weight; the one in force stays where
+#: it has a share of that. Tuned: with a tenth the wander of one flight whose sigma is twice as large (`def`, seed 10)
+#: is taken for a faster one at first, and its points are 11 % worse.
+ENOUGH_WEIGHT, STAYS = 0.5, 0.2
 #: Neighbours are weighed of factors whose cost is so far above the least: their weight is below 1e-4. Derived.
 COUNTS = 20.0
 #: Wanders are weighed where twice as large a one is more likely by so much, as minus twice the logarithm of a
@@ -99,15 +107,22 @@ class Likelihood:
     ----------
     pair : groups of position and attitude
     beforehand : what is known of the factors without the data in the window
+    at_most_s : what the attitude's correlation time is bounded by, see `SigmaFactors`
 
     Attributes
     ----------
     noise : of looks; None while it stays as it is
     changes : of the state for which it holds
+    times_s : what the attitude's correlation time may be bounded by, the one in force first
     """
 
     def __init__(
-        self, strip: WindowStrip, state: WindowState, pair: tuple[int, int], beforehand: Beforehand = NOTHING
+        self,
+        strip: WindowStrip,
+        state: WindowState,
+        pair: tuple[int, int],
+        beforehand: Beforehand = NOTHING,
+        at_most_s: float = np.inf,
     ) -> None:
         self.noise: LookNoise | None = None
         self.strip, self.changes, self.beforehand = strip, state.changes, beforehand
@@ -119,6 +134,14 @@ class Likelihood:
             self._apriori.append(as_stated)
             self._rows.append(rows)
             matrix[np.ix_(own[-1], own[-1])] -= in_force
+        self.times_s: tuple[float, ...] = (at_most_s,)
+        self._attitude = [(self._apriori[1], 0.0)]
+        if pair == WANDERS and len(strip.attitude_times_s) > 1 and self._rows[1]:
+            times_s = strip.attitude_times_s
+            now_s = at_most_s if at_most_s in times_s else np.inf
+            self.times_s = now_s, *(time_s for time_s in times_s if time_s != now_s)
+            told = [strip.attitude_information(time_s, state) for time_s in self.times_s]
+            self._attitude = [(matrix, log_det - told[0][1]) for matrix, log_det in told]
         others = np.setdiff1d(np.arange(len(state)), np.concatenate(own))
         self._order = np.concatenate([others, *own])
         assert len(self._order) == len(state)
@@ -126,7 +149,7 @@ class Likelihood:
         self._matrix, self._rhs = block_of(matrix, self._order), rhs[self._order]
         self._of_noise: dict[float, _Eliminated | None] = {}
         self._of_position: dict[tuple[float, float], _Eliminated | None] = {}
-        self._known: dict[tuple[float, float, float], float] = {}
+        self._known: dict[tuple[float, float, float, int], float] = {}
 
     def prefers_larger(self, f: float, g: float) -> bool:
         """Whether larger factors than these, of position or attitude or both, are clearly more likely."""
@@ -137,16 +160,17 @@ class Likelihood:
         """By how much the cost falls where the factors are as much larger than these as is likely best."""
         return self.of(f, g, 1.0) - min(self.of(i * f, j * g, 1.0) for i in LARGER for j in LARGER)
 
-    def of(self, f: float, g: float, h: float) -> float:
-        """Of factors of position, attitude and noise; infinite where the equations have no solution."""
-        if (f, g, h) not in self._known:
-            self._known[f, g, h] = self._weighed(f, g, h)
-        return self._known[f, g, h]
+    def of(self, f: float, g: float, h: float, time: int = 0) -> float:
+        """Of factors of position, attitude and noise, and a time by its place; infinite where the equations have no
+        solution."""
+        if (f, g, h, time) not in self._known:
+            self._known[f, g, h, time] = self._weighed(f, g, h, time)
+        return self._known[f, g, h, time]
 
-    def _weighed(self, f: float, g: float, h: float) -> float:
+    def _weighed(self, f: float, g: float, h: float, time: int) -> float:
         if h not in self._of_noise:
             self._of_noise[h] = self._without_others(h)
-        both, (A, B), (a, b) = self._of_noise[h], self._apriori, self._rows
+        both, A, (B, log_det), (a, b) = self._of_noise[h], self._apriori[0], self._attitude[time], self._rows
         if both is None:
             return np.inf
         if (f, h) not in self._of_position:
@@ -163,7 +187,7 @@ class Likelihood:
         if self.noise is not None and h > 1.0:
             of_looks = 2.0 * self.noise.rows * np.log(h) - (1.0 - h**-2) * self.noise.square
         far = self.beforehand.cost(f, g) + np.log(h) ** 2 / USUAL_LOG**2
-        return float(gained + 2.0 * (a * np.log(f) + b * np.log(g)) + of_looks + far)
+        return float(gained - log_det + 2.0 * (a * np.log(f) + b * np.log(g)) + of_looks + far)
 
     def _without_others(self, h: float) -> _Eliminated | None:
         """The equations of the pair, without what is stated of it."""
@@ -175,14 +199,31 @@ class Likelihood:
         return _eliminated(matrix, rhs, self._first)
 
 
-def likely(cost: Likelihood, present: tuple[float, float]) -> tuple[float, float, float]:
+class Likely(NamedTuple):
+    """What is likely.
+
+    Attributes
+    ----------
+    position, attitude : factors of errors of one kind
+    noise : what the noise of looks is to be multiplied by
+    at_most_s : what the attitude's correlation time is to be bounded by
+    """
+
+    position: float
+    attitude: float
+    noise: float
+    at_most_s: float
+
+
+def likely(cost: Likelihood, present: tuple[float, float]) -> Likely:
     """Factors of errors of position and attitude of one kind, and what the noise of looks is to be multiplied by, from
     the likelihood of the data under a bank of them.
 
     Whether a position is off, or an attitude, or the looks are less good shows in the images by little. So each choice
     of factors is weighed by its restricted likelihood, and variances are averaged: where the data cannot tell, all are
     larger, and no sigma is too small. Most of the bank is far from likely: the search goes from the factors in force to
-    neighbours as long as they count.
+    neighbours as long as they count. An attitude that wanders faster than stated is another one of the models. What a
+    factor is depends on the time that it goes with, so one of them is chosen: the shortest that has half of the weight.
 
     Parameters
     ----------
@@ -193,29 +234,33 @@ def likely(cost: Likelihood, present: tuple[float, float]) -> tuple[float, float
     ------
     DivergedError : none of them has a likelihood that is a number
     """
-    banks = BANK, BANK, NOISES if cost.noise is not None else (1.0,)
+    banks = BANK, BANK, NOISES if cost.noise is not None else (1.0,), cost.times_s
     most = tuple(len(bank) for bank in banks)
     costs = np.full(most, np.inf)
     first = tuple(int(np.argmin(np.abs(np.log(np.divide(BANK, f))))) for f in present)
-    seen, waiting, least = {(*first, 0)}, [(*first, 0)], np.inf
+    seen, waiting, least = {(*first, 0, 0)}, [(*first, 0, 0)], np.inf
     while waiting:
         place = waiting.pop()
-        costs[place] = cost.of(*(bank[i] for bank, i in zip(banks, place, strict=True)))
+        costs[place] = cost.of(*(bank[i] for bank, i in zip(banks[:3], place[:3], strict=True)), place[3])
         least = min(least, costs[place])
         if costs[place] > least + COUNTS and np.isfinite(least):
             continue
-        beside = {(place[0] + i, place[1] + j, place[2] + k) for i, j, k in STEPS} - seen
+        beside = {tuple(np.add(place, step).tolist()) for step in STEPS} - seen
         near = sorted(c for c in beside if min(c) >= 0 and all(i < n for i, n in zip(c, most, strict=True)))
         seen.update(near)
         waiting.extend(near)
     if not np.isfinite(least):
         raise DivergedError("no sigma of the trajectory makes the tie points likely")
     weight = np.exp(-0.5 * (costs - least))
-    weight /= weight.sum()
-    square = [
-        float(weight.sum(axis=tuple(j for j in range(3) if j != i)) @ np.square(bank)) for i, bank in enumerate(banks)
+    of_time = weight.sum(axis=(0, 1, 2)) / weight.sum()
+    enough = ENOUGH_WEIGHT * np.where(np.arange(len(of_time)) == 0, STAYS, 1.0)
+    time = min(np.flatnonzero(of_time > enough).tolist(), key=lambda i: cost.times_s[i], default=0)
+    weight = weight[..., time] / weight[..., time].sum()
+    factors = [
+        float(np.sqrt(weight.sum(axis=tuple(j for j in range(3) if j != i)) @ np.square(bank)))
+        for i, bank in enumerate(banks[:3])
     ]
-    return float(np.sqrt(square[0])), float(np.sqrt(square[1])), float(np.sqrt(square[2]))
+    return Likely(factors[0], factors[1], factors[2], cost.times_s[time])
 
 
 @dataclass(frozen=True)

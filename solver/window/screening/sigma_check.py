@@ -30,7 +30,6 @@ import numpy as np
 
 from ...arrays import Array
 from ...models.base import ATTITUDE_WANDER, CONSTANT, ERROR_GROUPS, OFFSET, POSITION_WANDER, WANDERS
-from ...models.slow_errors import LEARNING_TIME_S
 from ...quantiles import chi2
 from ..state.network import LiveNetwork
 from ..state.sigma_factors import CHANGED, LARGEST, MOST_UP, changed
@@ -85,7 +84,7 @@ class SigmaCheck:
         self._network, self._newest, self._looks = network, newest, NoiseOfLooks(network)
         self._pairs = (WANDERS, CONSTANT)[: 1 + constants]
         self._told = np.ones(len(ERROR_GROUPS) + 2)
-        self._vibration = 0.0
+        self._vibration, self._told_at_most_s = 0.0, np.inf
         self._steady, self._changed_s, self._tells = 0, -np.inf, False
         self._told_platform: set[str] = set()
         self._likelihoods: dict[tuple[int, int], Likelihood] = {}
@@ -121,8 +120,8 @@ class SigmaCheck:
         if network.platform.question(PLATFORM_QUESTIONED):
             network.state.solve()
         self._question_camera(strip)
-        factor, of_image = self._slow_errors(strip, now_s, due)
-        of_slow = bool((factor != sigmas.apriori).any())
+        factor, at_most_s, of_image = self._slow_errors(strip, now_s, due)
+        of_slow = bool((factor != sigmas.apriori).any()) or at_most_s != sigmas.attitude_at_most_s
         # what the trajectory explains is no noise of looks
         self._steady = 0 if of_slow or of_image else self._steady + turns
         if self._steady >= STEADY:
@@ -134,7 +133,7 @@ class SigmaCheck:
                 of_image = self._looks.restate(judged)
         if of_slow or of_image:
             self._changed_s = now_s
-            self._restate(strip, np.clip(factor, 1.0, LARGEST))
+            self._restate(strip, np.clip(factor, 1.0, LARGEST), at_most_s)
             network.state.solve()
         self._tell()
         self._tell_platform()
@@ -185,10 +184,16 @@ class SigmaCheck:
         f, g = self._network.sigmas.apriori[list(pair)].tolist()
         return self._likelihood(strip, pair).gain(f, g)
 
-    def _restate(self, strip: WindowStrip, factor: Array) -> None:
-        """State the sigmas of slow errors anew, with factors (4,) that the residuals of a strip ask for."""
+    def _restate(self, strip: WindowStrip, factor: Array, at_most_s: float) -> None:
+        """State the sigmas of slow errors anew, with factors (4,) that the residuals of a strip ask for, and a bound on
+        the correlation time of the attitude's."""
         sigmas, state = self._network.sigmas, self._network.state
         sigmas.apriori, before = factor, state.changes
+        if at_most_s != sigmas.attitude_at_most_s:
+            sigmas.attitude_at_most_s = at_most_s
+            self._kept.another_attitude()
+            for each in self._network.flown:
+                each.hurry_attitude(at_most_s, factor, state)
         kept = (False, False)
         # where noise of looks had been taken for a wander, nothing has happened that a wander would have to keep
         if sigmas.image == 1.0 and not self._network.pose_noise.vibration:
@@ -199,21 +204,21 @@ class SigmaCheck:
             if cost.changes == before and all(g <= ({*pair} if s is strip else set()) for s, g in groups.items()):
                 cost.changes = state.changes
 
-    def _slow_errors(self, strip: WindowStrip, now_s: float, due: bool) -> tuple[Array, bool]:
-        """Factors (4,) that the residuals of a-priori equations ask for; whether the noise of looks was stated anew,
-        which may be what bends the trajectory."""
+    def _slow_errors(self, strip: WindowStrip, now_s: float, due: bool) -> tuple[Array, float, bool]:
+        """Factors (4,) that the residuals of a-priori equations ask for; what the attitude's correlation time is to be
+        bounded by; whether the noise of looks was stated anew, which may be what bends the trajectory."""
         before, state = self._network.sigmas.apriori, self._network.state
         group, square, redundancy = strip.apriori_fit(state, now_s - MEMORY_S)
         n = len(ERROR_GROUPS)
         squares, redundancies = np.bincount(group, square, n), np.bincount(group, redundancy, n)
-        factor, of_looks = before.copy(), False
+        factor, at_most_s, of_looks = before.copy(), self._network.sigmas.attitude_at_most_s, False
         known = redundancies >= LEAST_REDUNDANCY
         too_large = [
             known[g] and squares[g] > chi2.isf(p, redundancies[g]) for g, p in zip(CONSTANT, QUESTIONED, strict=True)
         ]
         contradicted = any(too_large) or self._offset_or_mounting(strip, now_s)
         weighed = known & (factor > 1.0)
-        guessed = strip.slow.wander_time_s < 2.0 * LEARNING_TIME_S  # nearer to what is learnt than to what is stated
+        guessed = strip.slow.is_learnt
         weighed[POSITION_WANDER] |= guessed and squares[POSITION_WANDER] > redundancies[POSITION_WANDER] > PLENTY
         for pair in self._pairs:
             asked = weighed[list(pair)] | (pair == CONSTANT and contradicted)
@@ -229,13 +234,18 @@ class SigmaCheck:
                     asked |= True
             if not asked.any():
                 continue
-            *wanted, ratio = likely(cost, present)
-            noise = self._looks.known() if pair == WANDERS and max(np.divide(wanted, present)) > CHANGED else None
+            found = likely(cost, present)
+            larger = max(np.divide(found[:2], present)) > CHANGED or found.at_most_s != cost.times_s[0]
+            noise = self._looks.known() if pair == WANDERS and larger else None
             if noise is not None:
                 cost.noise = noise
-                *wanted, ratio = likely(cost, present)
+                found = likely(cost, present)
                 cost.noise = None
-            for g, w, it in zip(pair, wanted, asked, strict=True):
+            ratio = found.noise
+            if pair == WANDERS and found.at_most_s != cost.times_s[0]:
+                at_most_s, asked[1] = found.at_most_s, False
+                factor[ATTITUDE_WANDER] = min(max(found.attitude, 1.0), MOST_UP * present[1])
+            for g, w, it in zip(pair, found[:2], asked, strict=True):
                 if it:
                     factor[g] = changed(float(factor[g]), w / float(factor[g]))
             # gross errors count in the likelihood, and not in a median
@@ -243,16 +253,18 @@ class SigmaCheck:
             if noise is not None and ratio > CHANGED:
                 self._looks.state(noise.variance * ratio**2, noise.pixel, noise.sigma_px)
                 of_looks = True
-            if (factor != before).any() or of_looks:
+            if (factor != before).any() or at_most_s != self._network.sigmas.attitude_at_most_s or of_looks:
                 break  # what wanders is looked at first; the rest when that is settled
-        return factor, of_looks
+        return factor, at_most_s, of_looks
 
     def _likelihood(self, strip: WindowStrip, pair: tuple[int, int]) -> Likelihood:
         """The cost of factors of a pair: as it was where nothing has changed since but these factors."""
         cost = self._likelihoods.get(pair)
         if cost is None or cost.strip is not strip or cost.changes != self._network.state.changes:
             beforehand = self._from_earlier.get(pair, NOTHING)
-            cost = self._likelihoods[pair] = Likelihood(strip, self._network.state, pair, beforehand)
+            cost = self._likelihoods[pair] = Likelihood(
+                strip, self._network.state, pair, beforehand, self._network.sigmas.attitude_at_most_s
+            )
         return cost
 
     def _offset_or_mounting(self, strip: WindowStrip, now_s: float) -> bool:
@@ -276,6 +288,14 @@ class SigmaCheck:
                 f"sigmas: the attitude vibrates by {1e3 * np.degrees(vibration):.1f} mdeg, which nobody stated"
                 if vibration
                 else "sigmas: the attitude does not vibrate any more"
+            )
+        at_most_s = self._network.sigmas.attitude_at_most_s
+        if at_most_s != self._told_at_most_s:
+            self._told_at_most_s = at_most_s
+            self.events.append(
+                f"sigmas: the attitude wanders within {at_most_s:g} s, faster than stated"
+                if at_most_s < np.inf
+                else "sigmas: the attitude wanders as slowly as stated"
             )
         calibration = self._network.calibration
         now = np.array([*self._network.sigmas.apriori, self._network.sigmas.image, calibration.factor])

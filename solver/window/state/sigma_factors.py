@@ -22,6 +22,8 @@ class SigmaFactors:
     Attributes
     ----------
     apriori : (4,) of the slow errors, by `ERROR_GROUPS`
+    attitude_at_most_s : correlation time that the attitude's wander has where a longer one is stated; inf where it is
+        as stated
     image : of lines and samples
     version : how often `image` has changed
     disagreement : by how much the looks that came last disagree more than all sigmas allow, 1 where they do not: a
@@ -29,6 +31,7 @@ class SigmaFactors:
     """
 
     apriori: Array = field(default_factory=lambda: np.ones(len(ERROR_GROUPS)))
+    attitude_at_most_s: float = np.inf
     image: float = 1.0
     version: int = 0
     disagreement: float = 1.0

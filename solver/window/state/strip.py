@@ -11,6 +11,7 @@ from ...arrays import Array, IntArray
 from ...geometry.trajectory import Poses
 from ...models import MODELS
 from ...models.base import (
+    ATTITUDE_WANDER,
     CONSTANT,
     ERROR_GROUPS,
     WANDERS,
@@ -24,7 +25,7 @@ from ...models.base import (
 from ...models.dgr import DgrOptions
 from ...models.lim import LimOptions
 from ...models.ppm import PpmOptions
-from ...models.slow_errors import LEARNING_TIME_S, SlowErrors
+from ...models.slow_errors import SlowErrors
 from ...models.wander import NOTHING, SEGMENT_SHARE, Wander, WanderOptions
 from ..results import WindowOptions
 from .platform import LivePlatform
@@ -40,6 +41,10 @@ _SAMPLING = 0.05
 #: the noise of an image coordinate on the ground and in the air. There are half as many unknowns and less, and over
 #: seeds errors are no larger (bench/apriori.py).
 LEFT_OUT_M, LEFT_OUT = 0.035, 1.5e-5
+#: Correlation times that an attitude may have in place of a longer one that is stated, s.
+ATTITUDE_TIMES_S = (6.0,)
+#: One that is stated is longer than another by so much, at least, where it may be that one. Tuned.
+CLEARLY_SHORTER = 1.5
 
 
 def segment_length(slow: SlowErrors, options: WindowOptions) -> float:
@@ -59,7 +64,7 @@ def model_options(slow: SlowErrors, options: WindowOptions, length_s: float) -> 
     step = segment_length(slow, options)
     pieces = max(1, int(np.ceil(length_s / step - 1e-9)))
     if options.model == "wander":
-        if slow.wander_times_s.min() > LEARNING_TIME_S or options.segment_s:
+        if not slow.is_learnt or options.segment_s:
             return WanderOptions(slow, step)
         return WanderOptions(slow, step, LEFT_OUT_M, LEFT_OUT)
     if options.model == "dgr":
@@ -147,6 +152,7 @@ class WindowStrip:
         state: WindowState,
         joined_s: float = -np.inf,
         factor: Array | None = None,
+        attitude_at_most_s: float = np.inf,
         platform: LivePlatform | None = None,
     ):
         self.id = id
@@ -163,6 +169,8 @@ class WindowStrip:
         self.model: CorrectionModel = model_options(slow, options, length).build(
             Extent(f"strip {id}", start_s, first_line_time_s + length)
         )
+        if isinstance(self.model, Wander) and attitude_at_most_s < np.inf:
+            self.model.hurry_attitude(attitude_at_most_s)
         self.numbers = state.new_numbers(self.model.n_unknowns)
         self._prior = self.model.pseudo_observations()
         self._row_done = np.zeros(len(self._prior), dtype=bool)
@@ -183,6 +191,27 @@ class WindowStrip:
         if np.isfinite(border_s):
             self._look_up_uses()
         return border_s
+
+    @property
+    def attitude_times_s(self) -> tuple[float, ...]:
+        """What the correlation time of the attitude's wander may be bounded by; inf, as stated, first."""
+        stated_s = float(self.slow.wander_times_s[3]) if isinstance(self.model, Wander) else 0.0
+        return np.inf, *(time_s for time_s in ATTITUDE_TIMES_S if time_s < stated_s / CLEARLY_SHORTER)
+
+    def hurry_attitude(self, at_most_s: float, factor: Array, state: WindowState) -> None:
+        """Bound the correlation time of the attitude's wander, of all of the strip, and multiply its sigmas by that of
+        factors (4,); inf for as stated. What it was found to be with another time says nothing."""
+        if not isinstance(self.model, Wander):
+            return
+        rows = self._rows_present(state)
+        rows = rows[self._group[rows] == ATTITUDE_WANDER]
+        columns, coefficients, value, before = self._rows(rows)
+        none = np.full(len(rows), np.inf)
+        state.reweigh(columns, coefficients, value, before, none)
+        self.model.hurry_attitude(at_most_s)
+        self._scale[(self._group == ATTITUDE_WANDER) & self._row_done] = factor[ATTITUDE_WANDER]
+        columns, coefficients, value, now = self._rows(rows)
+        state.reweigh(columns, coefficients, value, none, now)
 
     def _look_up_uses(self) -> None:
         self._first_use, self._last_use = self._uses(self._step_s)
@@ -249,8 +278,10 @@ class WindowStrip:
         scale = self._scale[rows]
         return StatedConstants(columns, coefficients, value, sigma / scale, self._group[rows], scale)
 
-    def _rows(self, rows: IntArray) -> tuple[NDArray[np.int32], Array, Array, Array]:
-        p: PseudoObservations = self._prior
+    def _rows(
+        self, rows: IntArray, prior: PseudoObservations | None = None
+    ) -> tuple[NDArray[np.int32], Array, Array, Array]:
+        p = prior or self._prior
         columns = np.where(p.columns[rows] >= 0, self.numbers[p.columns[rows]], -1).astype(np.int32)
         return columns, p.coefficients[rows], p.value[rows], p.sigma[rows] * self._scale[rows]
 
@@ -307,6 +338,21 @@ class WindowStrip:
             np.bincount(at, p.ravel(), u * u).astype(float).reshape(u, u) for p in (stated, products)
         )
         return numbers, as_stated, in_force, len(rows)
+
+    def attitude_information(self, at_most_s: float, state: WindowState) -> tuple[Array, float]:
+        """What `apriori_information` says as stated of the attitude's wander (u, u) if its correlation time were
+        bounded; the logarithm of the determinant of these equations, in those unknowns that they bring into being."""
+        assert isinstance(self.model, Wander)
+        rows = self._rows_present(state)
+        rows = rows[self._group[rows] == ATTITUDE_WANDER]
+        columns, coefficients, _, sigma = self._rows(rows, self.model.if_attitude_hurried(at_most_s))
+        numbers, place = _touched(columns)
+        b = np.where(columns >= 0, coefficients, 0.0) * (self._scale[rows] / sigma)[:, None]
+        last = b.shape[1] - 1 - np.argmax(b[:, ::-1] != 0.0, axis=1)  # each brings one, of which it speaks last
+        log_det = float(2.0 * np.log(np.abs(b[np.arange(len(b)), last])).sum())
+        u = len(numbers)
+        at = (place[:, :, None] * u + place[:, None, :]).ravel()
+        return np.bincount(at, (b[:, :, None] * b[:, None, :]).ravel(), u * u).astype(float).reshape(u, u), log_det
 
     def _rows_present(self, state: WindowState) -> IntArray:
         """A-priori equations whose unknowns are all in the state."""

@@ -49,8 +49,18 @@ def test_a_less_certain_pose_makes_its_components_less_certain_and_none_more():
 
 
 def test_a_filter_that_still_learns_has_faster_errors():
-    slow = TOLD.widened(covariance(), learning=True)
+    slow = TOLD.widened(covariance(), learnt=(True,) * 6)
     assert slow.wander_time_s < TOLD.wander_time_s and slow.shift == TOLD.shift and slow.offset_m == TOLD.offset_m
+    assert slow.attitude_time_s == 6.0
+
+
+def test_an_attitude_that_is_measured_wanders_as_stated_where_positions_are_learnt():
+    learnt = (True,) * 3 + (False,) * 3
+    for slow in (TOLD.widened(covariance(), learnt), TOLD.widened(covariance(position=3.0))):
+        assert slow.attitude_time_s == TOLD.wander_time_s > slow.wander_time_s
+        assert slow.wander == TOLD.wander and slow.shift == TOLD.shift
+        assert slow.grown(covariance(position=9.0)).attitude_time_s == TOLD.wander_time_s
+        assert slow.grown(covariance(attitude=9.0)).attitude_time_s == 6.0
 
 
 def test_what_is_left_of_a_covariance_is_one():

@@ -43,7 +43,7 @@ def test_the_mean_over_a_long_strip_stays_as_uncertain_as_the_stated_wander_make
     def of_mean(slow: SlowErrors) -> np.ndarray:
         return np.sqrt(np.square(slow.wander_m) * autocorrelation(slow.wander_time_s, lag).mean())
 
-    for slow in (stated.widened(P), stated.widened(np.zeros((6, 6)), learning=True)):
+    for slow in (stated.widened(P), stated.widened(np.zeros((6, 6)), learnt=(True,) * 6)):
         assert of_mean(slow) == pytest.approx(of_mean(stated), rel=0.05)
         assert (slow.wander_density[:3] > 2.0 * stated.wander_density[:3]).all()  # beside faster changes
         assert slow.attitude_time_s == LEARNING_TIME_S and slow.offset_m == stated.offset_m
