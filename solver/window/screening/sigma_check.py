@@ -17,6 +17,10 @@ falls, the wander that is present may keep what it had (`kept_wanders`); not whe
 larger since, which had been taken for it. A strip that begins keeps the factors that earlier ones have shown until it
 has looks of its own, and those of its constant errors longer, since each strip is one sample more of the same sigma.
 
+An attitude that swings within ten seconds where half a minute is stated would have to wander a hundred times as far to
+follow that, and be as uncertain in all that is slow. So a shorter correlation time of its wander is one more model of
+the bank, and holds for all of the strip, and for those that come, where it is the likelier one.
+
 Noise of the looks (`look_noise`) comes after the trajectory. But few looks with much noise look as if the trajectory
 wandered, and a wander that is stated so large would follow their noise from then on. So before one is stated larger,
 noise of looks is a third factor of the likelihood.
@@ -192,6 +196,7 @@ class SigmaCheck:
         if at_most_s != sigmas.attitude_at_most_s:
             sigmas.attitude_at_most_s = at_most_s
             self._kept.another_attitude()
+            self._likelihoods.clear()
             for each in self._network.flown:
                 each.hurry_attitude(at_most_s, factor, state)
         kept = (False, False)

@@ -397,6 +397,9 @@ def test_costs_hold_while_nothing_changes_but_their_factors(camera_network):
     check._restate(strip, np.array([2.0, 1.0, 2.0, 5.0]), np.inf)  # those of another pair
     assert check._likelihood(strip, WANDERS) is not cost
     cost = check._likelihood(strip, WANDERS)
+    check._restate(strip, np.array([2.0, 1.0, 2.0, 1.5]), 6.0)  # another correlation time
+    assert check._likelihood(strip, WANDERS).times_s[0] == 6.0 != cost.times_s[0]
+    cost = check._likelihood(strip, WANDERS)
     seen(strip, state)  # another look
     assert check._likelihood(strip, WANDERS) is not cost
 
