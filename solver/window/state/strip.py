@@ -173,6 +173,7 @@ class WindowStrip:
             self.model.hurry_attitude(attitude_at_most_s)
         self.numbers = state.new_numbers(self.model.n_unknowns)
         self._prior = self.model.pseudo_observations()
+        self._if_hurried: dict[float, PseudoObservations] = {}
         self._row_done = np.zeros(len(self._prior), dtype=bool)
         self.factor = np.ones(4) if factor is None else factor.copy()
         self._group = error_groups(self._prior.labels)
@@ -188,6 +189,7 @@ class WindowStrip:
         """Another wander from a border on, where the model is one of wander; see `Wander.restate`."""
         assert isinstance(self.model, Wander)
         border_s = self.model.restate(from_s, [*slow.wander_m, *slow.wander], slow.wander_times_s, another)
+        self._if_hurried.clear()
         if np.isfinite(border_s):
             self._look_up_uses()
         return border_s
@@ -343,9 +345,11 @@ class WindowStrip:
         """What `apriori_information` says as stated of the attitude's wander (u, u) if its correlation time were
         bounded; the logarithm of the determinant of these equations, in those unknowns that they bring into being."""
         assert isinstance(self.model, Wander)
+        if at_most_s not in self._if_hurried:
+            self._if_hurried[at_most_s] = self.model.if_attitude_hurried(at_most_s)
         rows = self._rows_present(state)
         rows = rows[self._group[rows] == ATTITUDE_WANDER]
-        columns, coefficients, _, sigma = self._rows(rows, self.model.if_attitude_hurried(at_most_s))
+        columns, coefficients, _, sigma = self._rows(rows, self._if_hurried[at_most_s])
         numbers, place = _touched(columns)
         b = np.where(columns >= 0, coefficients, 0.0) * (self._scale[rows] / sigma)[:, None]
         last = b.shape[1] - 1 - np.argmax(b[:, ::-1] != 0.0, axis=1)  # each brings one, of which it speaks last
@@ -424,6 +428,7 @@ class WindowStrip:
         none = np.empty(0)
         self.model = DgrOptions().build(self.model.extent)  # a small one: that of the strip names all its unknowns
         self._prior = PseudoObservations(np.empty((0, 1), np.int32), none[:, None], none, none, ())
+        self._if_hurried.clear()
         self._need = self._first_use = self._last_use = self._scale = none
         self._row_done = self._entered = np.empty(0, dtype=bool)
         self.numbers = np.empty(0, dtype=np.int64)

@@ -76,6 +76,17 @@ def test_the_cost_of_a_time_is_the_likelihood_of_the_observations(slow):
     assert np.subtract(found, found[0]) == pytest.approx(np.subtract(expected, expected[0]), rel=1e-5, abs=1e-3)
 
 
+def test_what_is_known_of_a_time_follows_a_wander_that_is_stated_anew():
+    state = WindowState()
+    strip = strip_in(state)
+    for _ in range(2):
+        for at_most_s in (np.inf, FAST_S, np.inf):
+            strip.hurry_attitude(at_most_s, np.ones(4), state)
+            of_time, _ = strip.attitude_information(at_most_s, state)
+            assert of_time == pytest.approx(strip.apriori_information(ATTITUDE_WANDER, state)[1], rel=1e-12)
+        strip.restate(12.0, replace(SLOW, wander=(4e-4,) * 3))
+
+
 @pytest.mark.parametrize("slow", [SLOW, LEARNT])
 def test_a_time_stated_anew_is_that_stated_from_the_start(slow):
     expected_state, state = WindowState(), WindowState()
