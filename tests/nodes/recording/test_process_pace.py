@@ -203,7 +203,8 @@ def test_what_is_in_doubt_is_looked_at_more_often(tmp_path):
         reader = RecordingReader(done)
         assert any("the attitude vibrates by" in m.body.message for m in reader.messages(["event/log"]))
         reports = [m.stamp_ns for m in reader.messages(["adjustment/report"])]
-        assert 10 < len(reports) < 2.2 * plan.strip_s  # each half second at most
+        flight_s = plan.lead_in_s + plan.strip_s + plan.lead_out_s
+        assert 10 < len(reports) < 2.2 * flight_s  # each half second at most
         off, C = component_errors(reader, simulation), covariances(reader)
         nees.append(np.einsum("ni,ni->n", off, np.linalg.solve(C, off[:, :, None])[:, :, 0]).mean() / 6.0)
     assert 0.6 < np.mean(nees) < 1.6
