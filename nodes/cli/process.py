@@ -119,8 +119,9 @@ def run(args: argparse.Namespace) -> int:
             raise lacking(reader, f"nothing to process for {args.nodes}: {held_topics(reader)}")
         if not summary.outputs:
             raise lacking(reader, f"nothing came out: {_waiting(summary)}")
+        missing = ""
         if NAVIGATOR in summary.nodes and not summary.outputs.keys() & set(POSES):
-            notes.append(f"no trajectory came out, so nothing is oriented: {_no_trajectory(summary)}")
+            missing = f"no trajectory came out, so nothing is oriented: {_no_trajectory(summary)}"
         os.replace(part, args.output)
     except OSError as error:
         raise UserError(f"{args.output}: cannot be written: {(error.strerror or str(error)).lower()}") from None
@@ -130,15 +131,23 @@ def run(args: argparse.Namespace) -> int:
     for name, text in summary.failed.items():
         print(f"triline process: {reader.path}: {name} {text}", file=sys.stderr)
     if args.json:
-        more = {"pace": pace, "notes": [*summary.notes, *notes]}
+        more = {"pace": pace, "notes": [*summary.notes, *notes, *([missing] if missing else [])]}
         print(json_text(result(summary, reader, args.output, seconds) | more))
-        return 0
+        return _ended(reader, missing)
     for line in (*_lines(summary, args.output, seconds), *(f"  note: {note}" for note in notes)):
         print(line)
     if pace != args.pace and pace == "throughput" and ADJUSTER in summary.nodes:
         print("  live orientation is that of updates 10 s apart; that of a flight comes with --pace load")
     tell_damage("process", reader)
-    return 0
+    return _ended(reader, missing)
+
+
+def _ended(reader: RecordingReader, missing: str) -> int:
+    """Exit code; what is missing is said last, where `batch` looks for the reason of a failure."""
+    if not missing:
+        return 0
+    print(f"triline process: {reader.path}: {missing}", file=sys.stderr)
+    return 1
 
 
 def usual_pace(reader: RecordingReader, nodes: Sequence[str]) -> str:

@@ -68,5 +68,9 @@ def test_a_flight_without_a_trajectory_is_told_with_the_reason(topic, field, sai
                     setattr(body, field, float("nan"))
                 message = replace(message, body=body)
             writer.write(message)
-    assert main(["process", str(flight), "-o", str(out), "-q"]) == 0
-    assert f"note: no trajectory came out, so nothing is oriented: {said}" in capsys.readouterr().out
+    for options in ([], ["--json"]):
+        assert main(["process", str(flight), "-o", str(out), "-q", *options]) == 1
+        told, missing = capsys.readouterr(), f"no trajectory came out, so nothing is oriented: {said}"
+        assert told.err.splitlines()[-1].startswith(f"triline process: {flight}: {missing}")
+        assert out.is_file()  # with all that is in the flight
+    assert json.loads(told.out)["notes"][-1].startswith(missing)
