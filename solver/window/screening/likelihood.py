@@ -234,14 +234,16 @@ def likely(cost: Likelihood, present: tuple[float, float]) -> Likely:
     ------
     DivergedError : none of them has a likelihood that is a number
     """
-    banks = BANK, BANK, NOISES if cost.noise is not None else (1.0,), cost.times_s
-    most = tuple(len(bank) for bank in banks)
+    noises = NOISES if cost.noise is not None else (1.0,)
+    most = len(BANK), len(BANK), len(noises), len(cost.times_s)
     costs = np.full(most, np.inf)
     first = tuple(int(np.argmin(np.abs(np.log(np.divide(BANK, f))))) for f in present)
-    seen, waiting, least = {(*first, 0, 0)}, [(*first, 0, 0)], np.inf
+    begin: tuple[int, ...] = (*first, 0, 0)
+    seen, waiting, least = {begin}, [begin], np.inf
     while waiting:
         place = waiting.pop()
-        costs[place] = cost.of(*(bank[i] for bank, i in zip(banks[:3], place[:3], strict=True)), place[3])
+        i, j, k, time = place
+        costs[place] = cost.of(BANK[i], BANK[j], noises[k], time)
         least = min(least, costs[place])
         if costs[place] > least + COUNTS and np.isfinite(least):
             continue
@@ -254,13 +256,14 @@ def likely(cost: Likelihood, present: tuple[float, float]) -> Likely:
     weight = np.exp(-0.5 * (costs - least))
     of_time = weight.sum(axis=(0, 1, 2)) / weight.sum()
     enough = ENOUGH_WEIGHT * np.where(np.arange(len(of_time)) == 0, STAYS, 1.0)
-    time = min(np.flatnonzero(of_time > enough).tolist(), key=lambda i: cost.times_s[i], default=0)
-    weight = weight[..., time] / weight[..., time].sum()
-    factors = [
-        float(np.sqrt(weight.sum(axis=tuple(j for j in range(3) if j != i)) @ np.square(bank)))
-        for i, bank in enumerate(banks[:3])
-    ]
-    return Likely(factors[0], factors[1], factors[2], cost.times_s[time])
+    chosen = min(np.flatnonzero(of_time > enough).tolist(), key=lambda i: cost.times_s[i], default=0)
+    weight = weight[..., chosen] / weight[..., chosen].sum()
+    squares = (
+        weight.sum(axis=others) @ np.square(bank)
+        for others, bank in zip(((1, 2), (0, 2), (0, 1)), (BANK, BANK, noises), strict=True)
+    )
+    f, g, h = (float(np.sqrt(square)) for square in squares)
+    return Likely(f, g, h, cost.times_s[chosen])
 
 
 @dataclass(frozen=True)
