@@ -13,7 +13,7 @@ from .gauss_markov import autocorrelation, damping_rate
 Array = NDArray[np.floating]
 Three = tuple[float, float, float]
 _NONE: Three = (0.0, 0.0, 0.0)
-#: Of the components of an orientation, those that a filter learns.
+#: A filter that learns none of the six components of an orientation.
 NOTHING_LEARNT = (False,) * 6
 
 #: A pose variance more than this many times what was said beforehand is clearly larger.

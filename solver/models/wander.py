@@ -212,14 +212,14 @@ class Wander(CorrectionModel):
         self._state_anew()
         return float(self.borders[first])
 
-    def hurry_attitude(self, at_most_s: float) -> None:
+    def bound_attitude_time(self, at_most_s: float) -> None:
         """Take the attitude's correlation time for no longer than so many seconds, inf for as stated; the arrays that
         `pseudo_observations` gave change, and borders in use stay."""
         self._attitude_at_most_s = at_most_s
         self._state_anew()
 
-    def if_attitude_hurried(self, at_most_s: float) -> PseudoObservations:
-        """What `pseudo_observations` would be after `hurry_attitude`."""
+    def if_attitude_time_bound(self, at_most_s: float) -> PseudoObservations:
+        """What `pseudo_observations` would be after `bound_attitude_time`."""
         return self._stated(self._times_s(at_most_s))
 
     def _state_anew(self) -> None:

@@ -198,7 +198,7 @@ class SigmaCheck:
             self._kept.another_attitude()
             self._likelihoods.clear()
             for each in self._network.flown:
-                each.hurry_attitude(at_most_s, factor, state)
+                each.bound_attitude_time(at_most_s, factor, state)
         kept = (False, False)
         # where noise of looks had been taken for a wander, nothing has happened that a wander would have to keep
         if sigmas.image == 1.0 and not self._network.pose_noise.vibration:

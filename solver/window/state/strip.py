@@ -170,10 +170,10 @@ class WindowStrip:
             Extent(f"strip {id}", start_s, first_line_time_s + length)
         )
         if isinstance(self.model, Wander) and attitude_at_most_s < np.inf:
-            self.model.hurry_attitude(attitude_at_most_s)
+            self.model.bound_attitude_time(attitude_at_most_s)
         self.numbers = state.new_numbers(self.model.n_unknowns)
         self._prior = self.model.pseudo_observations()
-        self._if_hurried: dict[float, PseudoObservations] = {}
+        self._if_bound: dict[float, PseudoObservations] = {}
         self._row_done = np.zeros(len(self._prior), dtype=bool)
         self.factor = np.ones(4) if factor is None else factor.copy()
         self._group = error_groups(self._prior.labels)
@@ -189,7 +189,7 @@ class WindowStrip:
         """Another wander from a border on, where the model is one of wander; see `Wander.restate`."""
         assert isinstance(self.model, Wander)
         border_s = self.model.restate(from_s, [*slow.wander_m, *slow.wander], slow.wander_times_s, another)
-        self._if_hurried.clear()
+        self._if_bound.clear()
         if np.isfinite(border_s):
             self._look_up_uses()
         return border_s
@@ -200,7 +200,7 @@ class WindowStrip:
         stated_s = float(self.slow.wander_times_s[3]) if isinstance(self.model, Wander) else 0.0
         return np.inf, *(time_s for time_s in ATTITUDE_TIMES_S if time_s < stated_s / CLEARLY_SHORTER)
 
-    def hurry_attitude(self, at_most_s: float, factor: Array, state: WindowState) -> None:
+    def bound_attitude_time(self, at_most_s: float, factor: Array, state: WindowState) -> None:
         """Bound the correlation time of the attitude's wander, of all of the strip, and multiply its sigmas by that of
         factors (4,); inf for as stated. What it was found to be with another time says nothing."""
         if not isinstance(self.model, Wander):
@@ -210,7 +210,7 @@ class WindowStrip:
         columns, coefficients, value, before = self._rows(rows)
         none = np.full(len(rows), np.inf)
         state.reweigh(columns, coefficients, value, before, none)
-        self.model.hurry_attitude(at_most_s)
+        self.model.bound_attitude_time(at_most_s)
         self._scale[(self._group == ATTITUDE_WANDER) & self._row_done] = factor[ATTITUDE_WANDER]
         columns, coefficients, value, now = self._rows(rows)
         state.reweigh(columns, coefficients, value, none, now)
@@ -333,30 +333,25 @@ class WindowStrip:
         columns, coefficients, _, sigma = self._rows(rows)
         numbers, place = _touched(columns)
         b = np.where(columns >= 0, coefficients, 0.0) / sigma[:, None]
-        u, products = len(numbers), b[:, :, None] * b[:, None, :]
-        at = (place[:, :, None] * u + place[:, None, :]).ravel()
+        products = b[:, :, None] * b[:, None, :]
         stated = products * self._scale[rows, None, None] ** 2
-        as_stated, in_force = (
-            np.bincount(at, p.ravel(), u * u).astype(float).reshape(u, u) for p in (stated, products)
-        )
+        as_stated, in_force = (_summed(p, place, len(numbers)) for p in (stated, products))
         return numbers, as_stated, in_force, len(rows)
 
     def attitude_information(self, at_most_s: float, state: WindowState) -> tuple[Array, float]:
         """What `apriori_information` says as stated of the attitude's wander (u, u) if its correlation time were
         bounded; the logarithm of the determinant of these equations, in those unknowns that they bring into being."""
         assert isinstance(self.model, Wander)
-        if at_most_s not in self._if_hurried:
-            self._if_hurried[at_most_s] = self.model.if_attitude_hurried(at_most_s)
+        if at_most_s not in self._if_bound:
+            self._if_bound[at_most_s] = self.model.if_attitude_time_bound(at_most_s)
         rows = self._rows_present(state)
         rows = rows[self._group[rows] == ATTITUDE_WANDER]
-        columns, coefficients, _, sigma = self._rows(rows, self._if_hurried[at_most_s])
+        columns, coefficients, _, sigma = self._rows(rows, self._if_bound[at_most_s])
         numbers, place = _touched(columns)
         b = np.where(columns >= 0, coefficients, 0.0) * (self._scale[rows] / sigma)[:, None]
         last = b.shape[1] - 1 - np.argmax(b[:, ::-1] != 0.0, axis=1)  # each brings one, of which it speaks last
         log_det = float(2.0 * np.log(np.abs(b[np.arange(len(b)), last])).sum())
-        u = len(numbers)
-        at = (place[:, :, None] * u + place[:, None, :]).ravel()
-        return np.bincount(at, (b[:, :, None] * b[:, None, :]).ravel(), u * u).astype(float).reshape(u, u), log_det
+        return _summed(b[:, :, None] * b[:, None, :], place, len(numbers)), log_det
 
     def _rows_present(self, state: WindowState) -> IntArray:
         """A-priori equations whose unknowns are all in the state."""
@@ -428,7 +423,7 @@ class WindowStrip:
         none = np.empty(0)
         self.model = DgrOptions().build(self.model.extent)  # a small one: that of the strip names all its unknowns
         self._prior = PseudoObservations(np.empty((0, 1), np.int32), none[:, None], none, none, ())
-        self._if_hurried.clear()
+        self._if_bound.clear()
         self._need = self._first_use = self._last_use = self._scale = none
         self._row_done = self._entered = np.empty(0, dtype=bool)
         self.numbers = np.empty(0, dtype=np.int64)
@@ -448,3 +443,9 @@ def _touched(columns: NDArray[np.int32]) -> tuple[IntArray, NDArray[np.int64]]:
     numbers = np.unique(columns)
     numbers = numbers[numbers >= 0].astype(np.int64)
     return numbers, np.minimum(np.searchsorted(numbers, columns), max(len(numbers) - 1, 0))
+
+
+def _summed(products: Array, place: NDArray[np.int64], u: int) -> Array:
+    """Normal equations (u, u) from the products (m, t, t) of coefficients at places (m, t)."""
+    at = (place[:, :, None] * u + place[:, None, :]).ravel()
+    return np.bincount(at, products.ravel(), u * u).astype(float).reshape(u, u)

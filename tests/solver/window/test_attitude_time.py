@@ -81,7 +81,7 @@ def test_what_is_known_of_a_time_follows_a_wander_that_is_stated_anew():
     strip = strip_in(state)
     for _ in range(2):
         for at_most_s in (np.inf, FAST_S, np.inf):
-            strip.hurry_attitude(at_most_s, np.ones(4), state)
+            strip.bound_attitude_time(at_most_s, np.ones(4), state)
             of_time, _ = strip.attitude_information(at_most_s, state)
             expected = strip.apriori_information(ATTITUDE_WANDER, state)[1]
             assert of_time == pytest.approx(expected, rel=1e-9, abs=1e-12 * np.abs(expected).max())
@@ -94,7 +94,7 @@ def test_a_time_stated_anew_is_that_stated_from_the_start(slow):
     expected, strip = strip_in(expected_state, slow, FAST_S), strip_in(state, slow)
     before = state.normal()[0]
     strip.restate_sigmas(np.array([1.0, 1.0, 1.0, 40.0]), state)  # of the other time: it says nothing of this one
-    strip.hurry_attitude(FAST_S, np.ones(4), state)
+    strip.bound_attitude_time(FAST_S, np.ones(4), state)
     strip.factor = np.ones(4)
     for s, of in ((expected, expected_state), (strip, state)):
         s.activate(38.0, of)  # what comes later has it, too
@@ -106,7 +106,7 @@ def test_a_time_stated_anew_is_that_stated_from_the_start(slow):
         assert got == pytest.approx(want, rel=1e-12)
     again = WindowState()
     other = strip_in(again, slow, FAST_S)
-    other.hurry_attitude(np.inf, np.ones(4), again)
+    other.bound_attitude_time(np.inf, np.ones(4), again)
     assert again.normal()[0] == pytest.approx(before, rel=1e-9, abs=1e-9 * before.max())
 
 
