@@ -86,6 +86,8 @@ class QualityFindings:
     narrowly : share of looks that fail narrowly, see `Tails`
     disagreement, trajectory : see `SigmaFactors`; the latter of offset, of shift and drift, and of the wander of
         position: that of the attitude shows in the images, and its sigma is what these say
+    attitude_at_most_s : see `SigmaFactors`. A shorter time than stated makes the light weak: it is found where looks
+        contradict what is stated, and then the position may be what is worse, too
     camera : in what it is not as calibrated, see `CameraCheck`; None where nothing says so
     calibration : how many times as large its errors are as stated, see `LiveCalibration`
     light, reason : that are shown, see `LightDisplay`
@@ -117,6 +119,7 @@ class QualityFindings:
     narrowly: float = 0.0
     disagreement: float = 1.0
     trajectory: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    attitude_at_most_s: float = np.inf
     camera: CameraDoubt | None = None
     calibration: float = 1.0
     light: str = GOOD
@@ -162,9 +165,11 @@ def contradiction(s: QualityFindings) -> tuple[str, str] | None:
     if s.narrowly > HEAVY_TAILS:
         share = f"{100.0 * s.narrowly:.0f} % of the looks fail narrowly"
         return WEAK, f"{share}: their errors have heavier tails than stated, sigmas of points are too small"
-    names = [f"{n} {f:.1f} times" for n, f in zip(ERROR_GROUPS, s.trajectory, strict=False) if f > DOUBTED]
-    if names:
-        return WEAK, f"the trajectory is worse than stated: {', '.join(names)}"
+    doubts = [f"{n} {f:.1f} times" for n, f in zip(ERROR_GROUPS, s.trajectory, strict=False) if f > DOUBTED]
+    if s.attitude_at_most_s < np.inf:
+        doubts.append(f"the attitude wanders within {s.attitude_at_most_s:g} s")
+    if doubts:
+        return WEAK, f"the trajectory is worse than stated: {', '.join(doubts)}"
     return None
 
 

@@ -139,6 +139,7 @@ class QualityControl:
             narrowly=network.tails.share(batches),
             disagreement=float(network.sigmas.disagreement),
             trajectory=(a, b, c),
+            attitude_at_most_s=network.sigmas.attitude_at_most_s,
         )
         light, reason = self._display.look(now_s, found)
         self.last = replace(found, light=light, reason=reason)

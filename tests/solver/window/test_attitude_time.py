@@ -14,6 +14,7 @@ from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.misspecified_study import OBSERVED, ROWS, SETTINGS
 from triline.solver.simulation.scenario import simulate
 from triline.solver.simulation.window_study import adjust_online, navigate, point_errors
+from triline.solver.window.quality.light import GOOD
 from triline.solver.window.results import WindowOptions
 from triline.solver.window.screening.likelihood import NOTHING, Likelihood, likely
 from triline.solver.window.state.strip import ATTITUDE_TIMES_S, WindowStrip
@@ -147,6 +148,7 @@ def test_a_swinging_attitude_is_told_and_later_strips_begin_with_it():
     assert told == [f"sigmas: the attitude wanders within {FAST_S:g} s, faster than stated"]
     window = online.window
     assert window.network.sigmas.attitude_at_most_s == FAST_S
+    assert online.reports[-1].quality.attitude_at_most_s == FAST_S and online.reports[-1].quality.light != GOOD
     assert 4.0 < window.network.sigmas.apriori[ATTITUDE_WANDER] < 20.0
     assert 0.5 < point_errors(simulation, online.whole_points).nees.mean() < 1.6
 

@@ -201,6 +201,7 @@ DRIFT = BiasedSource("matcher-2", "B", 0.0, 0.5, 0.0, 0.02, 60.0, 36.0, 10.0)
             "wanted 6; 40 % of the looks came when the window had passed them: is it shorter than from one view to",
         ),
         ({"trajectory": (2.5, 1.0, 1.9)}, WEAK, "the trajectory is worse than stated: offset 2.5 times"),
+        ({"attitude_at_most_s": 6.0}, WEAK, "the trajectory is worse than stated: the attitude wanders within 6 s"),
     ],
 )  # fmt: skip
 def test_the_light_says_why(change, colour, words):
