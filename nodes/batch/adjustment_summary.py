@@ -52,7 +52,7 @@ def _head(c: Content) -> Iterator[str]:
     test = c["chi_square_test"]
     verdict = "passed" if test["passed"] else "FAILED"
     tested = f"chi-square 95 %: {_number(test['low'])} to {_number(test['high'])}, {verdict}"
-    if c["redundancy"] <= 0:
+    if test["passed"] is None:
         tested = "taken, not found: nothing is redundant, and nothing tested"
     yield (
         f"sigma0 {c['sigma0']:.4f} = {c['sigma0_px']:.4f} px ({tested}), "

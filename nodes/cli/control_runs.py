@@ -113,7 +113,7 @@ class Found:
         these NaN, of points of one image point (`Pool.single`)
     given_m2 : (k,) what the given coordinates add to the variance of a difference, all its coordinates together
     n_unknowns : of images: orientation, camera, corrections; without coordinates of points
-    sigma0, passed : and whether its chi-square test passed
+    sigma0, passed : and whether its chi-square test passed; None where nothing was redundant
     """
 
     check: tuple[str, ...]
@@ -123,7 +123,7 @@ class Found:
     n_unknowns: int
     redundancy: int
     sigma0: float
-    passed: bool
+    passed: bool | None
     converged: bool
     undetermined: int
 

@@ -189,7 +189,7 @@ def _text(study: Study, verbose: bool, snooped: bool) -> Iterator[str]:
     yield from verdict(study)
     for id, times in study.suspicious.items():
         yield f"check point {id} is off by {times:.1f} times its sigma with the best, too: are its coordinates right?"
-    large = [row for row in study.rows if (f := row.run.found) and not f.passed and f.sigma0 > 1.0]
+    large = [row for row in study.rows if (f := row.run.found) and f.passed is False and f.sigma0 > 1.0]
     if 2 * len(large) > len(study.rows) and not snooped:
         yield f"sigma0 is too large in {len(large)} of {len(study.rows)} runs: gross errors? try --snoop"
 
@@ -214,11 +214,12 @@ def _table(study: Study) -> Iterator[str]:
             continue
         figures = "".join(f" {metres(value)}" for value in (*row.rmse_m, *row.sigma_m))
         marks = "best" if row is study.best else "as good" if row.as_good and study.enough else ""
+        fails = "!" if found.passed is False else " "
         yield (
-            f"{start}{row.n_check:6d}{found.n_unknowns:9d}{found.sigma0:7.3f}{' ' if found.passed else '!'} {figures}"
+            f"{start}{row.n_check:6d}{found.n_unknowns:9d}{found.sigma0:7.3f}{fails} {figures}"
             f" {metres(row.rmse_3d_m):>12s}  {marks or row.note}"
         ).rstrip()
-    if any(row.run.found and not row.run.found.passed for row in study.rows):
+    if any(row.run.found and row.run.found.passed is False for row in study.rows):
         yield "! sigma0 fails its chi-square test (95 %): errors or a-priori sigmas are not as stated"
 
 

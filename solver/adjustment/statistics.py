@@ -23,7 +23,7 @@ class GlobalTest:
     sigma0 : a-posteriori standard deviation of unit weight, 1 a priori [K 4.54]; 1 without redundancy
     redundancy : n - u
     low, high : limits of sigma0 at the significance level, two-sided
-    passed : whether sigma0 lies between them; without redundancy nothing can be tested and it passes
+    passed : whether sigma0 lies between them; None without redundancy, since nothing is tested then
     """
 
     sigma0: float
@@ -32,8 +32,8 @@ class GlobalTest:
     high: float
 
     @property
-    def passed(self) -> bool:
-        return self.low <= self.sigma0 <= self.high
+    def passed(self) -> bool | None:
+        return self.low <= self.sigma0 <= self.high if self.redundancy else None
 
 
 def global_test(weighted_squares: float, redundancy: int, alpha: float = ALPHA) -> GlobalTest:

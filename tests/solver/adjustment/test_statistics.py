@@ -25,7 +25,7 @@ def test_global_test_limits_hold_their_share():
 
 def test_global_test_without_redundancy_says_nothing():
     test = global_test(0.0, 0)
-    assert test.sigma0 == 1.0 and test.passed and test.high == np.inf
+    assert test.sigma0 == 1.0 and test.passed is None and test.high == np.inf
 
 
 def test_global_test_fails_on_both_sides():
