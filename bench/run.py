@@ -124,6 +124,16 @@ BENCHMARKS = (
         8,
     ),
     Benchmark(
+        "known-orientation",
+        "What could nobody do better there, who knows the orientation exactly?",
+        (
+            "python bench/known_orientation.py",
+            "python bench/known_orientation.py --seeds 3 --motion "
+            "../shared/data/avirisng/ang20170323t202244_eph_att --from 800",
+        ),
+        1,
+    ),
+    Benchmark(
         "camera-errors",
         "And where the camera is not as calibrated?",
         ("python bench/camera_errors.py",),
@@ -564,7 +574,7 @@ def machine(minutes: float) -> str:
     if cpuinfo.exists() and (found := re.search(r"model name\s*: (.*)", cpuinfo.read_text())):
         model = found.group(1)
     day = datetime.date.today().isoformat()
-    return f"{day}, {os.cpu_count()} cores of {model}, Python {platform.python_version()}, {minutes:.0f} minutes."
+    return f"{day}, {os.cpu_count()} cores of {model}, Python {platform.python_version()}, {minutes:.0f} minute{'s' * (round(minutes) != 1)}."
 
 
 def overview() -> list[str]:

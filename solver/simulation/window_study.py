@@ -349,21 +349,25 @@ def point_errors(
     return Errors(error, covariance, np.zeros(len(chosen)))
 
 
-def direct_points(simulation: Simulation, poses: Iterable[TimedPose]) -> Errors:
-    """Errors of object points by direct georeferencing: space intersection with the smoothed measured trajectory."""
-    chosen = [p.pose for p in poses if p.pose.smoothed]
-    measured = Trajectory([p.time_s for p in chosen], [p.position_l for p in chosen], [p.quaternion for p in chosen])
+def rays_of(simulation: Simulation, orientation: Trajectory) -> ImageRays:
+    """All looks of a flight with an orientation: as it was measured, or the true one."""
     flight, images = simulation.flight, simulation.images
     looks = images.looks
     period = np.array([1.0 / s.line_rate_hz for s in flight.strips])[looks.strip]
     first_s = np.array([s.first_line_time_s for s in flight.strips])[looks.strip]
-    at = measured.at(first_s + images.line * period)  # as measured
+    at = orientation.at(first_s + images.line * period)
     xy, pitch = flight.camera.image_coordinates(looks.ccd, images.sample)
     sigma = np.full(len(looks), simulation.observation_plan.image_sigma_px)
-    rays = ImageRays(
+    return ImageRays(
         looks.point, at.time_s, period, at.position_l, at.angles, at.velocity_l, at.angle_rate, xy, pitch,
         flight.camera.focal_length_mm[looks.ccd], sigma, sigma,
     )  # fmt: skip
-    found = intersect(rays, len(simulation.points))
+
+
+def direct_points(simulation: Simulation, poses: Iterable[TimedPose]) -> Errors:
+    """Errors of object points by direct georeferencing: space intersection with the smoothed measured trajectory."""
+    chosen = [p.pose for p in poses if p.pose.smoothed]
+    measured = Trajectory([p.time_s for p in chosen], [p.position_l for p in chosen], [p.quaternion for p in chosen])
+    found = intersect(rays_of(simulation, measured), len(simulation.points))
     use = found.known & (simulation.points.role != "control")
     return Errors(found.xyz_l[use] - simulation.points.xyz_l[use], found.covariance[use], np.zeros(int(use.sum())))
