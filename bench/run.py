@@ -574,7 +574,8 @@ def machine(minutes: float) -> str:
     if cpuinfo.exists() and (found := re.search(r"model name\s*: (.*)", cpuinfo.read_text())):
         model = found.group(1)
     day = datetime.date.today().isoformat()
-    return f"{day}, {os.cpu_count()} cores of {model}, Python {platform.python_version()}, {minutes:.0f} minute{'s' * (round(minutes) != 1)}."
+    took = f"{minutes:.0f} minute{'s' * (round(minutes) != 1)}"
+    return f"{day}, {os.cpu_count()} cores of {model}, Python {platform.python_version()}, {took}."
 
 
 def overview() -> list[str]:
