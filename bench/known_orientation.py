@@ -72,10 +72,9 @@ def squares(simulation: Simulation, row: str, rng: np.random.Generator) -> tuple
     found = intersect(rays, len(simulation.points))
     use = found.known & (simulation.points.role != "control")
     density = log_student if ROWS[row].world.heavy_tails else log_normal
-    return tuple(
-        float(((xyz[use] - simulation.points.xyz_l[use]) ** 2).sum(axis=1).mean())
-        for xyz in (found.xyz_l, best(rays, found, density, rng))
-    )
+    errors = (xyz[use] - simulation.points.xyz_l[use] for xyz in (found.xyz_l, best(rays, found, density, rng)))
+    of_least_squares, of_best = (float((e**2).sum(axis=1).mean()) for e in errors)
+    return of_least_squares, of_best
 
 
 def main() -> None:
