@@ -125,13 +125,13 @@ BENCHMARKS = (
     ),
     Benchmark(
         "known-orientation",
-        "What could nobody do better there, who knows the orientation exactly?",
+        "And how good would points be if the orientation were known exactly?",
         (
             "python bench/known_orientation.py",
             "python bench/known_orientation.py --seeds 3 --motion "
             "../shared/data/avirisng/ang20170323t202244_eph_att --from 800",
         ),
-        1,
+        4,
     ),
     Benchmark(
         "camera-errors",

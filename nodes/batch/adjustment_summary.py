@@ -50,10 +50,11 @@ def _head(c: Content) -> Iterator[str]:
         f"{c['n_observations']} observations, {c['n_unknowns']} unknowns, redundancy {c['redundancy']}"
     )
     test = c["chi_square_test"]
-    verdict = "passed" if test["passed"] else "FAILED"
-    tested = f"chi-square 95 %: {_number(test['low'])} to {_number(test['high'])}, {verdict}"
     if test["passed"] is None:
         tested = "taken, not found: nothing is redundant, and nothing tested"
+    else:
+        verdict = "passed" if test["passed"] else "FAILED"
+        tested = f"chi-square 95 %: {_number(test['low'])} to {_number(test['high'])}, {verdict}"
     yield (
         f"sigma0 {c['sigma0']:.4f} = {c['sigma0_px']:.4f} px ({tested}), "
         f"{c['iterations']} iterations, {'converged' if c['converged'] else 'NOT CONVERGED'}, {c['seconds']:.2f} s"

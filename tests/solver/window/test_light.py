@@ -46,6 +46,7 @@ OFF = replace(FINE, ground_protection_m=np.full(4, 2.0))
 OVER = replace(FINE, strip="", control=np.zeros(3), exposure=None, ground_protection_m=NONE, ground_sigma_m=NONE)
 TORN = replace(FINE, fit=replace(FINE.fit, sigma0=2.0))
 STEPPED = replace(FINE, trajectory=(1.0, 1.0, 3.4))
+SWUNG = replace(FINE, attitude_at_most_s=6.0)
 
 
 # ---- on the ground
@@ -271,6 +272,9 @@ def test_before_the_first_strip_there_is_nothing_to_say():
         # a step of the GNSS on the way stays in the strip, a moment does not
         ([FINE] * 10 + [STEPPED] * 4 + [FINE] * 6, 0.5, WEAK, "worse than stated: wander of position 3.4 times"),
         ([FINE] * 19 + [STEPPED] + [FINE] * 20, 0.5, GOOD, "strip S1 over"),
+        # a correlation time holds for all of the strip, or for nothing of it
+        ([FINE] * 10 + [SWUNG] * 10, 0.5, WEAK, "worse than stated: the attitude wanders within 6 s"),
+        ([FINE] * 5 + [SWUNG] * 10 + [FINE] * 5, 0.5, GOOD, "strip S1 over"),
         (
             [replace(FINE, control=np.zeros(3), exposure=replace(CALM, sigma=np.full(6, 0.9)))] * 20, 0.5,
             WEAK, "strip S1 over: no control within 25 s; position and height datum rest on GNSS",
