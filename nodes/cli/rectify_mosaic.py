@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import lru_cache
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,7 @@ from ..formats.projection import notes_of_map, unit_of
 from ..formats.stac import write_stac_item
 from ..recording.access import Recording
 from ..recording.reader import RecordingReader
+from ..recording.summary import held_by_both
 from . import rectify_image
 from .damage import tell_damage, tell_other_camera, tell_other_frame
 from .heights_under import rasters_of_heights
@@ -225,7 +227,18 @@ def _kinds(args: argparse.Namespace) -> list[tuple[str, Path, str | None]]:
             out.append(("orthoimage", path, sigmas[images.index(path)] if sigmas else None))
     if len({path.resolve() for path in inputs}) < len(inputs):
         raise UserError("the same input twice")
+    _refuse_one_flight_twice([path for kind, path, _ in out if kind == "recording"])
     return out
+
+
+def _refuse_one_flight_twice(paths: list[Path]) -> None:
+    """Refuse a flight beside what was made of it: seams would run between its two orientations."""
+    for one, other in combinations((RecordingReader(path) for path in paths), 2):
+        if number := held_by_both(one, other, "sensor/lines/*"):
+            raise UserError(
+                f"{other.path} holds {number} of the messages with image lines of {one.path}: is it the same flight, "
+                "as recorded and as processed? wanted one of them"
+            )
 
 
 def _refuse_without_effect(args: argparse.Namespace, kinds: set[str]) -> None:
