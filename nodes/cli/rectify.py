@@ -16,7 +16,7 @@ from ..errors import UserError
 from ..formats.geotiff import write_orthoimage
 from ..formats.importable import refuse_importable
 from ..formats.json_text import json_text
-from ..formats.new_file import refuse_unless_file
+from ..formats.new_file import refuse_unless_writable
 from ..formats.projection import notes_of_map
 from ..recording.remote import path_of
 from . import rectify_image, rectify_mosaic
@@ -140,7 +140,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UserError(f"{args.input}: is a folder, wanted a recording with image lines")
     refuse_importable(args.input)
     for path in (args.output, *(() if args.sigma is None else (Path(args.sigma),))):
-        refuse_unless_file(path)
+        refuse_unless_writable(path)
     if args.sigma is not None and Path(args.sigma).resolve() == args.output.resolve():
         raise UserError("-o, --sigma: wanted different files")
     for name in ("gsd", "height"):

@@ -28,7 +28,7 @@ from ..batch.image_rectification import ErrorMap, Ground, ImageRectification, So
 from ..errors import UserError
 from ..formats.height_raster import DATUMS, HeightRaster
 from ..formats.json_text import json_text
-from ..formats.new_file import refuse_unless_file
+from ..formats.new_file import refuse_unless_writable
 from ..formats.projection import notes_of_map, unit_of
 from ..formats.table import Column, read_table
 from .heights_under import below_camera, height_range, rasters_of_heights
@@ -196,7 +196,7 @@ def rectified(args: argparse.Namespace, told: Any = None) -> tuple[_Sensor, Grou
 def _check(args: argparse.Namespace) -> None:
     for path in (args.output, args.mask, args.sigma):
         if path is not None:
-            refuse_unless_file(Path(path))
+            refuse_unless_writable(Path(path))
     refuse_over_files((args.output, args.mask, args.sigma), rasters_of_heights(args.dem or ()))
     named = [str(Path(p).resolve()) for p in (args.output, args.mask, args.sigma) if p is not None]
     if len(set(named)) < len(named):

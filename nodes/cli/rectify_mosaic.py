@@ -43,7 +43,7 @@ from ..errors import UserError
 from ..formats.geotiff import is_virtual
 from ..formats.height_raster import RasterFile
 from ..formats.json_text import json_text
-from ..formats.new_file import refuse_unless_file
+from ..formats.new_file import refuse_unless_writable
 from ..formats.projection import notes_of_map, unit_of
 from ..formats.stac import write_stac_item
 from ..recording.access import Recording
@@ -170,9 +170,7 @@ def _outputs(args: argparse.Namespace) -> Outputs:
 def _check(args: argparse.Namespace, outputs: Outputs) -> None:
     named = [p for p in (*_assets(outputs).values(), args.stac) if p is not None]
     for path in named:
-        refuse_unless_file(path)
-        if not path.parent.is_dir():
-            raise UserError(f"{path}: no folder {path.parent}")
+        refuse_unless_writable(path)
     if args.stac is not None:
         for path in (p for p in _assets(outputs).values() if p is not None):
             seen = os.path.relpath(path, args.stac.parent)

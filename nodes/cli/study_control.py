@@ -21,7 +21,7 @@ from ...solver.models import MODELS
 from ..batch.scene_adjustment import SETS
 from ..errors import UserError
 from ..formats.json_text import json_text, plain
-from ..formats.new_file import new_file, refuse_unless_file
+from ..formats.new_file import new_file, refuse_unless_writable
 from ..formats.scene_block import is_scene_block, read_scene_block
 from ..formats.table import write_table
 from .adjust import read_input
@@ -92,9 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     for path in (args.csv, args.plot, args.page):
         if path:
-            refuse_unless_file(path)
-            if not path.parent.is_dir():
-                raise UserError(f"{path}: no folder {path.parent}")
+            refuse_unless_writable(path)
     if args.plot and args.plot.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise UserError(f"--plot {args.plot}: wanted a name that ends in .png, .svg or .pdf")
     for option in ("segments", "fixes", "iterations", "jobs"):

@@ -24,7 +24,7 @@ from ...solver.simulation.misspecified_study import (
 from ...solver.simulation.real_motion import RealMotion
 from ..errors import UserError
 from ..formats.json_text import json_text, plain
-from ..formats.new_file import new_file, refuse_unless_file
+from ..formats.new_file import new_file, refuse_unless_writable
 from ..simulator.flight_settings import GROUND_M
 from ..simulator.motion_track import motion_of
 from ..simulator.world_settings import world_text
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError("--from and --ground belong to a motion: wanted --motion")
     for path in (args.csv, args.page):
         if path:
-            refuse_unless_file(Path(path))
+            refuse_unless_writable(Path(path))
     motion = _motion(args) if args.motion else None
     rows = [row for row in ROWS if row in args.rows]
     keys = [(setting, row) for setting in args.settings for row in rows]

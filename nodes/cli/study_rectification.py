@@ -18,7 +18,7 @@ import numpy as np
 from ...solver.rectification.comparison import METHODS, Compared, Noise, compare
 from ..errors import UserError
 from ..formats.json_text import json_text
-from ..formats.new_file import new_file, refuse_unless_file
+from ..formats.new_file import new_file, refuse_unless_writable
 from ..formats.table import write_table
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError("--pixel-sigma, --ground-sigma: wanted one above 0")
     for path in (args.csv, args.plot, args.page):
         if path:
-            refuse_unless_file(Path(path))
+            refuse_unless_writable(Path(path))
     noise = Noise(args.pixel_sigma, args.ground_sigma, args.height_sigma)
     sizes = (args.control, args.check)
     wrong = replace(noise, blunders=_BLUNDERS)

@@ -17,7 +17,7 @@ import numpy as np
 from ...solver.rectification.nine_pixels import PUBLISHED, ROUNDING, conditions, curve, iterations, outcomes
 from ..errors import UserError
 from ..formats.json_text import json_text, plain
-from ..formats.new_file import new_file, refuse_unless_file
+from ..formats.new_file import new_file, refuse_unless_writable
 
 EXAMPLE = "triline study regularisation --draws 200 --plot l-curve.png"
 
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     if args.draws < 1:
         raise UserError(f"--draws {args.draws}: wanted at least 1")
     if args.plot:
-        refuse_unless_file(Path(args.plot))
+        refuse_unless_writable(Path(args.plot))
     rows: list[dict[str, Any]] = []
     for (parameters, where), (before, after) in PUBLISHED.items():
         got = conditions(parameters, where)

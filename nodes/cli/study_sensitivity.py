@@ -46,7 +46,7 @@ from ...solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass
 from ..errors import UserError
 from ..formats.frame_json import is_frame_json, read_frame
 from ..formats.json_text import json_text
-from ..formats.new_file import new_file, refuse_unless_file
+from ..formats.new_file import new_file, refuse_unless_writable
 from ..formats.satellite.read import read_scene
 from ..formats.table import write_table
 
@@ -136,7 +136,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--grid {args.grid}: wanted 2 to 200 columns and rows")
     for name in (args.csv, args.map_csv, args.page):
         if name:
-            refuse_unless_file(Path(name))
+            refuse_unless_writable(Path(name))
     results, maps = [], []
     for name in args.scenes or _SCENES:
         scene = _scene(args, name)

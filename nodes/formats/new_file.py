@@ -66,6 +66,8 @@ def new_file(target: Path) -> Iterator[Path]:
     try:
         yield part
         os.replace(part, target)
+    except UserError as error:
+        raise UserError(str(error).replace(os.fspath(part), os.fspath(target))) from None
     except OSError as error:
         of_part = error.errno in _FULL if error.filename is None else error.filename == os.fspath(part)
         if not of_part:

@@ -1,0 +1,38 @@
+"""What cannot be written is refused before the work begins, under the name that was asked for."""
+
+from __future__ import annotations
+
+import pytest
+
+from triline.nodes.cli import main
+from triline.nodes.errors import UserError
+from triline.nodes.formats.new_file import new_file
+from triline.nodes.formats.table import write_table
+
+
+@pytest.mark.parametrize(
+    ("study", "work", "option"),
+    [
+        ("rectification", "compare", "--csv"),
+        ("sensitivity", "study", "--map-csv"),
+        ("misspecified", "_flights", "--page"),
+        ("regularisation", "conditions", "--plot"),
+    ],
+)
+def test_a_study_without_a_folder_for_its_table_does_not_begin(study, work, option, monkeypatch, capsys):
+    """It computed first, for hours where it has many flights."""
+
+    def begun(*_, **__):
+        raise AssertionError("the work began")
+
+    monkeypatch.setattr(f"triline.nodes.cli.study_{study}.{work}", begun)
+    assert main(["study", study, option, "nowhere/file.png"]) == 1
+    assert capsys.readouterr().err == "triline study: nowhere/file.png: no folder nowhere\n"
+
+
+def test_a_writer_that_fails_names_the_file_and_not_its_part(tmp_path):
+    """`triline view --rrd x.rrd` spoke of `.x.rrd.part` in a folder without permission."""
+    with pytest.raises(UserError) as refused, new_file(tmp_path / "runs.csv") as part:
+        part.symlink_to(tmp_path)
+        write_table(part, {"a": [1]}, {})
+    assert str(refused.value).startswith(f"{tmp_path / 'runs.csv'}: ")
