@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import UserError
+from ..formats.new_file import refuse_unless_writable
 
 
 def refuse_empty_words(argv: list[str]) -> None:
@@ -85,6 +86,13 @@ def refuse_over_files(written: Iterable[Path | str | None], read: Iterable[Path]
         for output in there:
             if os.path.isfile(path) and os.path.samefile(path, output):
                 raise UserError(f"{output}: the output would overwrite {path}, which is read")
+
+
+def refuse_unless_picture(path: Path) -> None:
+    """Raise UserError where ``--plot`` names what is no picture, or cannot be written: asked before the work."""
+    refuse_unless_writable(path)
+    if path.suffix.lower() not in (".png", ".svg", ".pdf"):
+        raise UserError(f"--plot {path}: wanted a name that ends in .png, .svg or .pdf")
 
 
 def refuse_folder_of_inputs(folder: Path) -> None:

@@ -41,6 +41,7 @@ from .control_runs import (
     with_control,
 )
 from .control_verdict import Row, Study, judge, metres, verdict
+from .outputs import refuse_unless_picture
 from .progress import progress
 
 EXAMPLE = """triline study control block/ --snoop --plot control.png
@@ -90,11 +91,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    for path in (args.csv, args.plot, args.page):
+    for path in (args.csv, args.page):
         if path:
             refuse_unless_writable(path)
-    if args.plot and args.plot.suffix.lower() not in (".png", ".svg", ".pdf"):
-        raise UserError(f"--plot {args.plot}: wanted a name that ends in .png, .svg or .pdf")
+    if args.plot:
+        refuse_unless_picture(args.plot)
     for option in ("segments", "fixes", "iterations", "jobs"):
         values = getattr(args, option)
         for value in values if isinstance(values, list) else [values]:

@@ -20,6 +20,7 @@ from ..errors import UserError
 from ..formats.json_text import json_text
 from ..formats.new_file import new_file, refuse_unless_writable
 from ..formats.table import write_table
+from .outputs import refuse_unless_picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,9 +53,11 @@ def run(args: argparse.Namespace) -> int:
             raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: wanted a number of at least 0")
     if args.pixel_sigma == args.ground_sigma == 0:
         raise UserError("--pixel-sigma, --ground-sigma: wanted one above 0")
-    for path in (args.csv, args.plot, args.page):
+    for path in (args.csv, args.page):
         if path:
             refuse_unless_writable(Path(path))
+    if args.plot:
+        refuse_unless_picture(Path(args.plot))
     noise = Noise(args.pixel_sigma, args.ground_sigma, args.height_sigma)
     sizes = (args.control, args.check)
     wrong = replace(noise, blunders=_BLUNDERS)
@@ -160,7 +163,7 @@ def _plot(path: Path, tables: dict[str, dict[str, Compared]]) -> None:
     from ..report.style import styled
 
     with styled(), new_file(path) as part:
-        _figure(tables).savefig(part, format=path.suffix.lstrip(".") or "png", dpi=120)
+        _figure(tables).savefig(part, format=path.suffix.lstrip(".").lower(), dpi=120)
 
 
 def _page(

@@ -17,7 +17,8 @@ import numpy as np
 from ...solver.rectification.nine_pixels import PUBLISHED, ROUNDING, conditions, curve, iterations, outcomes
 from ..errors import UserError
 from ..formats.json_text import json_text, plain
-from ..formats.new_file import new_file, refuse_unless_writable
+from ..formats.new_file import new_file
+from .outputs import refuse_unless_picture
 
 EXAMPLE = "triline study regularisation --draws 200 --plot l-curve.png"
 
@@ -32,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     if args.draws < 1:
         raise UserError(f"--draws {args.draws}: wanted at least 1")
     if args.plot:
-        refuse_unless_writable(Path(args.plot))
+        refuse_unless_picture(Path(args.plot))
     rows: list[dict[str, Any]] = []
     for (parameters, where), (before, after) in PUBLISHED.items():
         got = conditions(parameters, where)
@@ -115,5 +116,5 @@ def _plot(path: Path, seed: int) -> None:
         for side in ("top", "right"):
             axes.spines[side].set_visible(False)
     with new_file(path) as part:
-        figure.savefig(part, format=path.suffix.lstrip(".") or "png", dpi=120)
+        figure.savefig(part, format=path.suffix.lstrip(".").lower(), dpi=120)
     plt.close(figure)

@@ -30,6 +30,19 @@ def test_a_study_without_a_folder_for_its_table_does_not_begin(study, work, opti
     assert capsys.readouterr().err == "triline study: nowhere/file.png: no folder nowhere\n"
 
 
+@pytest.mark.parametrize(("study", "work"), [("rectification", "compare"), ("regularisation", "conditions")])
+def test_a_plot_of_another_kind_is_refused_before_the_work(study, work, tmp_path, monkeypatch, capsys):
+    """It was a fault in triline, after the work."""
+
+    def begun(*_, **__):
+        raise AssertionError("the work began")
+
+    monkeypatch.setattr(f"triline.nodes.cli.study_{study}.{work}", begun)
+    plot = tmp_path / "plot.txt"
+    assert main(["study", study, "--plot", str(plot)]) == 1
+    assert capsys.readouterr().err == f"triline study: --plot {plot}: wanted a name that ends in .png, .svg or .pdf\n"
+
+
 def test_a_writer_that_fails_names_the_file_and_not_its_part(tmp_path):
     """`triline view --rrd x.rrd` spoke of `.x.rrd.part` in a folder without permission."""
     with pytest.raises(UserError) as refused, new_file(tmp_path / "runs.csv") as part:
