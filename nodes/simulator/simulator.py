@@ -106,8 +106,8 @@ class Simulator(Node):
 
     @property
     def duration_s(self) -> float:
-        """From the first message to the last."""
-        return (self._order[-1][0] - self._order[0][0]) / convert.SECOND_NS
+        """Of the flight, as `triline info` has it: without the second before it in which it is configured."""
+        return self._order[-1][0] / convert.SECOND_NS
 
     def messages(self, epoch_ns: int) -> Iterator[Message]:
         """All messages in the order of their stamps; time 0 of the flight is ``epoch_ns``.

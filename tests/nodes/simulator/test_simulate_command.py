@@ -234,6 +234,8 @@ def test_recording_holds_the_flight(tmp_path, capsys):
     for message in read:
         by_topic[message.topic].append(message.sequence)
     assert all(numbers == list(range(len(numbers))) for numbers in by_topic.values())
+    assert main(["info", str(file), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["duration_s"] == pytest.approx(result["seconds"])
 
 
 def test_control_of_a_camera_with_one_ccd_line_is_measured_where_one_strip_sees_it(tmp_path, capsys):
