@@ -53,13 +53,18 @@ def _escape(c: str) -> str:
 
 
 class CleanStream:
-    """A text stream that writes lines and tabs as they are, and all other control characters as escapes."""
+    """A text stream that writes lines and tabs as they are, as escapes all other control characters and what its
+    encoding has not (a name with an umlaut on a terminal of ASCII).
+    """
 
     def __init__(self, stream: TextIO) -> None:
         self.stream = stream
 
     def write(self, text: str) -> int:
-        self.stream.write(_clean(text, "\n\t"))
+        shown, encoding = _clean(text, "\n\t"), getattr(self.stream, "encoding", None)
+        if encoding and not shown.isascii():
+            shown = shown.encode(encoding, "backslashreplace").decode(encoding)
+        self.stream.write(shown)
         return len(text)
 
     def writelines(self, lines: Any) -> None:

@@ -11,6 +11,7 @@ import sample_messages as sample
 from rich.console import Console
 from test_bad_input_commands import run_main
 
+from triline.nodes.cli import main
 from triline.nodes.monitor.monitor import MOST_NODES, Monitor, screen
 from triline.nodes.node import Message
 from triline.nodes.recording.writer import RecordingWriter
@@ -44,6 +45,14 @@ def test_streams_are_clean_inside_a_command_and_given_back_after_it():
     finally:
         sys.stdout = before
     assert caught.getvalue() == "a\tb\n\\x1b[31mc\n"
+
+
+def test_a_name_that_the_terminal_has_no_letters_for_is_shown_as_escapes(tmp_path, monkeypatch):
+    """The file was written, and then the line that says so was a fault in triline, with exit code 1."""
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii", write_through=True))
+    assert main(["new", "flight", str(tmp_path / "Süd")]) == 0
+    assert b"S\\xfcd/flight.toml: fill it in" in written.getvalue()
 
 
 def test_the_monitor_shows_hostile_states_names_and_events_as_plain_text():
