@@ -70,8 +70,9 @@ Key = tuple[str, str | None]  # strip and lens
 
 
 def is_block_folder(path: Path) -> bool:
-    """Whether a folder looks like a block folder; not one of results, which may have a camera."""
-    names = ["image_points.csv", "strips.csv", *([] if (path / "result.json").is_file() else ["camera.json"])]
+    """Whether a folder looks like a block folder; not one of results or of a flight, which may have a camera."""
+    other = any((path / name).is_file() for name in ("result.json", "flight.toml"))
+    names = ["image_points.csv", "strips.csv", *([] if other else ["camera.json"])]
     return path.is_dir() and any((path / name).is_file() for name in names)
 
 

@@ -72,7 +72,7 @@ def read_camera_instead(path: Path, camera: LineCamera, told: str = "", notes: l
     UserError : a camera that cannot be read, or with other CCD lines
     """
     if not path.is_file():
-        raise UserError(f"{path}: no such file, wanted a camera.json")
+        raise UserError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}, wanted a camera.json")
     found = read_camera(path, notes)
     lenses = max(len(camera.lenses), len(found.lenses)) > 1
 

@@ -82,6 +82,8 @@ class Recording:
     def __init__(self, path: str | Path) -> None:
         try:
             self.reader = RecordingReader(path, by_ranges=True)
+        except IsADirectoryError:
+            raise UserError(f"{path}: is a folder, wanted a recording") from None
         except OSError as error:
             raise UserError(f"{path}: {(error.strerror or str(error)).lower()}") from None
 

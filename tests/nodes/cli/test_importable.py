@@ -1,6 +1,7 @@
 """Commands that want a recording say how to make one of what they are given."""
 
 import pytest
+from places import ROOT
 from test_bad_input_commands import main
 
 POSES = "time_s,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg\n" + "".join(
@@ -28,6 +29,30 @@ def test_importable_input_is_named_with_the_command(tmp_path, capsys, monkeypatc
     err = capsys.readouterr().err
     kind = "trajectory as CSV" if made == "poses.csv" else "flight folder"
     assert kind in err and f"triline import {made} -o" in err and err.count("\n") == 1
+
+
+def test_a_flight_folder_with_its_camera_is_no_block(tmp_path, capsys):
+    """`adjust` of one asked for strips.csv, where a camera lay beside flight.toml as the docs have it."""
+    (tmp_path / "flight.toml").write_text('[flight]\nname = "x"\n')
+    (tmp_path / "camera.json").write_text(CAMERA)
+    assert main(["adjust", str(tmp_path)]) == 1
+    err = capsys.readouterr().err
+    assert "flight folder" in err and f"triline import {tmp_path} -o" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [
+        (["info", "."], ".: is a folder, wanted a recording"),
+        (["export", ".", "--points", "out.csv"], ".: is a folder, wanted a recording"),
+        (["process", "strip.mcap", "--camera", ".", "-o", "out.mcap"], ".: is a folder, wanted a camera.json"),
+    ],
+)
+def test_a_folder_is_told_as_one_with_what_was_wanted(tmp_path, capsys, monkeypatch, words, wanted):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "strip.mcap").symlink_to(ROOT / "recordings" / "strip.mcap")
+    assert main(words) == 1
+    assert capsys.readouterr().err == f"triline {words[0]}: {wanted}\n"
 
 
 CAMERA = '{"name": "c", "lenses": [{"focal_length_mm": 62.7}], "lines": [{"id": "F", "pixels": 2, "pixel_size_mm": 1}]}'
