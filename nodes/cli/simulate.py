@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ...solver.geometry.measured_trajectory import POSE_GAP_S
 from ...solver.simulation.ground_points import shortest_coverage_s
 from ...solver.simulation.orbital_scene import ORBITAL_SENSORS
 from ...solver.simulation.scenario import Simulation
@@ -229,7 +230,18 @@ def _summary(flight: SimulatedFlight, seconds: float, output: str, seed: int, co
         result["true"] = world_terms(simulation.world)
     if motion is not None:
         result["motion"] = {"poses": len(motion.trajectory), "steps_taken_out": motion.jumps}
+        result["notes"] += _gaps(motion.trajectory.time_s)
     return result
+
+
+def _gaps(time_s: np.ndarray) -> list[str]:
+    """A line where the recorded motion has no poses for longer than ten of its steps."""
+    step = np.diff(time_s)
+    gaps = step[step > max(POSE_GAP_S, 10.0 * float(np.median(step)))]
+    if not len(gaps):
+        return []
+    what = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
+    return [f"the recorded motion has {what}, of {gaps.max():.1f} s at most: its path is interpolated there"]
 
 
 def _left_out(simulation: Simulation, roles: Mapping[str, int]) -> list[str]:

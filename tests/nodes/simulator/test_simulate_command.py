@@ -480,6 +480,17 @@ def test_motion_of_a_csv_and_of_a_recording_that_was_made_with_it(tmp_path, caps
     assert again.truth.at([9.87]).angles == pytest.approx(truth.truth.at([9.87]).angles, abs=1e-8)
 
 
+def test_a_gap_in_a_motion_is_told(tmp_path, capsys):
+    """What `export --per-line` writes has no poses between strips: a strip was flown across, and nothing said so."""
+    whole = lively_track(tmp_path / "poses.csv").read_text().splitlines()
+    (tmp_path / "two.csv").write_text("\n".join([*whole[: len(whole) // 2], *whole[len(whole) // 2 + 60 :]]))
+    for name, gaps in (("poses.csv", 0), ("two.csv", 1)):
+        words = ["--motion", str(tmp_path / name), "--ground", "200", "--ties", "1", "--json"]
+        assert main(["simulate", "-o", str(tmp_path / "a.mcap"), *words]) == 0
+        notes = [note for note in json.loads(capsys.readouterr().out)["notes"] if "interpolated" in note]
+        assert len(notes) == gaps and all("motion has 1 gap, of " in note for note in notes), notes
+
+
 def test_motion_of_what_has_no_poses_is_refused_in_one_line(tmp_path, capsys):
     (tmp_path / "imu.csv").write_text("time_s\n")
     assert main(["simulate", "-o", str(tmp_path / "x.mcap"), "--motion", str(tmp_path)]) == 1
