@@ -27,8 +27,10 @@ from ..state.unknowns import WindowState, block_of
 BANK, USUAL_LOG = (1.0, 1.5, 2.3, 3.5, 5.5, 9.0, 15.0, 30.0, 60.0, 120.0), 1.2
 #: How far those of a strip usually are from what earlier strips have shown, as a logarithm. Tuned.
 FROM_STRIP_TO_STRIP_LOG = 0.4
-#: Before a wander is stated larger it is weighed against noise of looks that is so many times as large. Tuned.
-NOISES = (1.0, 1.2, 1.45, 1.75, 2.1, 2.6, 3.2, 4.0, 5.0)
+#: Before a wander is stated larger it is weighed against noise of looks that is so many times as large. Tuned; the
+#: largest by what it is for: a vibration of 0.03 deg (13 pixels) is 15 times the noise. With 5 as the largest it was a
+#: wander of any size, and turned the attitude by tens of degrees.
+NOISES = (1.0, 1.2, 1.45, 1.75, 2.1, 2.6, 3.2, 4.0, 5.0, 7.5, 11.0, 17.0, 25.0)
 #: The steps from a choice of factors to its neighbours.
 STEPS = tuple((*(0,) * i, by, *(0,) * (3 - i)) for i in range(4) for by in (1, -1))
 #: The shortest correlation time of the attitude is stated that has so much of the weight; the one in force stays where

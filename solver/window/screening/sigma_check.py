@@ -140,7 +140,8 @@ class SigmaCheck:
             self._restate(strip, np.clip(factor, 1.0, LARGEST), at_most_s)
             network.state.solve()
         self._tell()
-        self._tell_platform()
+        if self.settled(now_s) and sigmas.disagreement == 1.0:  # sigmas that are too small make anything certain
+            self._tell_platform()
         return of_slow, of_image
 
     def _remember(self, strip: WindowStrip, now_s: float) -> None:
