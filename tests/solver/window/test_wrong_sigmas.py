@@ -383,6 +383,24 @@ def test_the_cost_of_factors_is_that_of_the_whole_system(pair):
     assert [cost.of(*choice) for choice in choices] == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.parametrize("times", [3.0, 15.0])
+def test_noise_of_looks_is_no_wander_however_large_it_is(times):
+    """Of a vibration of 0.03 deg, 13 pixels. The noise was 5 times as stated at most, and the rest of it a wander."""
+    state, rng = WindowState(), np.random.default_rng(3)
+    strip = strip_in(state)
+    size = np.sqrt(np.diagonal(state.normal()[0]))
+    J, y = 0.1 * size * rng.standard_normal((120, len(size))), times * rng.standard_normal(120)
+    state.observe(np.tile(state.numbers, (120, 1)), J, y, np.ones(120))
+    state.solve()
+    cost = Likelihood(strip, state, WANDERS)
+    cost.noise = LookNoise(0.1, 1e-4, 0.3, 120, float(y @ y), J.T @ J, J.T @ y)
+    found = likely(cost, (1.0, 1.0))
+    assert found.noise == pytest.approx(times, rel=0.25)
+    assert max(found.position, found.attitude) < 4.0
+    cost = Likelihood(strip, state, WANDERS)  # where the noise is taken as stated
+    assert max(likely(cost, (1.0, 1.0))[:2]) > times
+
+
 def test_costs_hold_while_nothing_changes_but_their_factors(camera_network):
     state, check = camera_network.state, SigmaCheck(camera_network, Disagreement(camera_network.sigmas))
     strip = camera_network.strips["S1"] = strip_in(state)
