@@ -112,6 +112,7 @@ def run(args: argparse.Namespace) -> int:
     kinds = _kinds(args)
     _refuse_without_effect(args, {kind for kind, _, _ in kinds})
     _refuse_inputs(args, outputs, kinds)
+    _refuse_one_flight_twice([path for kind, path, _ in kinds if kind == "recording"])
     crs, gsd = _cells(args, kinds)
     if args.stac is not None and crs == "local":
         raise UserError("--stac: wanted a map projection (--crs), not the local frame")
@@ -225,7 +226,6 @@ def _kinds(args: argparse.Namespace) -> list[tuple[str, Path, str | None]]:
             out.append(("orthoimage", path, sigmas[images.index(path)] if sigmas else None))
     if len({path.resolve() for path in inputs}) < len(inputs):
         raise UserError("the same input twice")
-    _refuse_one_flight_twice([path for kind, path, _ in out if kind == "recording"])
     return out
 
 
