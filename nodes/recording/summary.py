@@ -215,14 +215,15 @@ def held_by_both(one: RecordingReader, other: RecordingReader, topic: str) -> in
     They are of one source and start, and have the same number and stamp. The first of them has the same bytes, too:
     simulated flights begin at one time.
     """
-    shared = 0
-    theirs = {(c.topic, c.source, c.start): c.id for c in other.channels.values()}
-    of_topic, of_topic_there = one.select([topic]), other.select([topic])
-    for channel in one.channels.values():
-        there = theirs.get((channel.topic, channel.source, channel.start))
-        if there is None:
-            continue
-        mine = of_topic[one.index.channel[of_topic] == channel.id]
+    whose, theirs = (
+        {(c.topic, c.source, c.start): c.id for c in reader.channels.values()} for reader in (one, other)
+    )  # fmt: skip
+    common = whose.keys() & theirs.keys()
+    if not common:
+        return 0  # other flights
+    shared, of_topic, of_topic_there = 0, one.select([topic]), other.select([topic])
+    for here, there in ((whose[key], theirs[key]) for key in common):
+        mine = of_topic[one.index.channel[of_topic] == here]
         found = of_topic_there[other.index.channel[of_topic_there] == there]
         numbers = one.index.sequence[mine], other.index.sequence[found]
         _, at, at_there = np.intersect1d(*numbers, return_indices=True)
