@@ -235,7 +235,7 @@ def _summary(flight: SimulatedFlight, seconds: float, output: str, seed: int, co
 
 
 def _gaps(time_s: np.ndarray) -> list[str]:
-    """A line where the recorded motion has no poses for longer than ten of its steps."""
+    """A line where the recorded motion has no poses for longer than nodes take for a gap, and than ten of its steps."""
     step = np.diff(time_s)
     gaps = step[step > max(POSE_GAP_S, 10.0 * float(np.median(step)))]
     if not len(gaps):

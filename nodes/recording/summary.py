@@ -209,31 +209,6 @@ def held_topics(reader: RecordingReader) -> str:
     return f"it holds {', '.join(held)}" if held else "it holds no message"
 
 
-def held_by_both(one: RecordingReader, other: RecordingReader, topic: str) -> int:
-    """How many messages of a topic are in both recordings; ``sensor/lines/*`` stands for all that it matches.
-
-    They are of one source and start, and have the same number and stamp. The first of them has the same bytes, too:
-    simulated flights begin at one time.
-    """
-    whose, theirs = (
-        {(c.topic, c.source, c.start): c.id for c in reader.channels.values()} for reader in (one, other)
-    )  # fmt: skip
-    common = whose.keys() & theirs.keys()
-    if not common:
-        return 0  # other flights
-    shared, of_topic, of_topic_there = 0, one.select([topic]), other.select([topic])
-    for here, there in ((whose[key], theirs[key]) for key in common):
-        mine = of_topic[one.index.channel[of_topic] == here]
-        found = of_topic_there[other.index.channel[of_topic_there] == there]
-        numbers = one.index.sequence[mine], other.index.sequence[found]
-        _, at, at_there = np.intersect1d(*numbers, return_indices=True)
-        mine, found = mine[at], found[at_there]
-        same = np.flatnonzero(one.index.stamp_ns[mine] == other.index.stamp_ns[found])
-        if len(same) and one.raw(mine[same[0]]).data == other.raw(found[same[0]]).data:
-            shared += len(same)
-    return shared
-
-
 def lacking(reader: RecordingReader, what: str) -> UserError:
     """The error of a recording in which something is missing, with the damage that may be why."""
     return UserError(f"{reader.path}: {what}{in_brackets(left_out_lines(reader))}")

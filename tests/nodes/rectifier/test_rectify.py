@@ -31,7 +31,6 @@ from triline.nodes.formats.trajectory_csv import read_poses_of_strips
 from triline.nodes.node import Message
 from triline.nodes.recording.access import Recording
 from triline.nodes.recording.reader import RecordingReader
-from triline.nodes.recording.summary import held_by_both
 from triline.nodes.recording.writer import RecordingWriter
 from triline.nodes.rectifier.rectifier import Rectifier
 from triline.nodes.simulator.flight_settings import simulated_flight
@@ -605,25 +604,21 @@ def test_a_mosaic_does_not_take_a_flight_beside_what_was_made_of_it(flown, tmp_p
     capsys.readouterr()
     assert main(["rectify", str(flown), str(again), "--mosaic", "--workers", "1", "-o", str(tmp_path / "b.tif")]) == 1
     said = capsys.readouterr().err
-    number = len(RecordingReader(flown).select(["sensor/lines/*"]))
-    assert f"again.mcap holds {number} of the messages with image lines of {flown}: is it the same flight" in said
+    assert "again.mcap begins with the same image lines (sensor/lines/" in said
+    assert f"as {flown}: is it the same flight" in said
     assert not list(tmp_path.glob("b*"))
 
 
-def test_messages_in_both_recordings_are_of_one_flight(tmp_path):
-    """Two simulated flights begin at one time and number their messages alike, and no byte of the lines is the same."""
-
-    def wrote(name, grey, stamps):
-        with RecordingWriter(tmp_path / name) as writer:
-            for k, stamp in enumerate(stamps):
-                body = m.RawImage(width=4, height=1, step=4, encoding="mono8", data=bytes([grey] * 4))
-                writer.write(Message("sensor/lines/N", stamp, body, "camera", k, 7))
-        return RecordingReader(tmp_path / name)
-
-    one, other = wrote("one.mcap", 1, (10, 20, 30)), wrote("other.mcap", 2, (10, 20, 30))
-    later = wrote("later.mcap", 1, (10, 20, 31, 40))
-    assert held_by_both(one, one, "sensor/lines/*") == 3 and held_by_both(one, later, "sensor/lines/N") == 2
-    assert held_by_both(one, other, "sensor/lines/*") == 0 and held_by_both(one, later, "sensor/lines/F") == 0
+def test_simulated_flights_that_begin_at_one_time_are_two(flown, tmp_path, capsys):
+    """Their messages have the same stamps and numbers; only the pixels tell them apart."""
+    other = tmp_path / "other.mcap"
+    with RecordingWriter(other) as writer:
+        for x in RecordingReader(flown).sorted_messages():
+            if x.topic.startswith("sensor/lines/"):
+                x = replace(x, body=replace(x.body, pixels=255 - x.body.pixels))
+            writer.write(x)
+    words = ["--mosaic", "--height", 0, "--gsd", 20, "--workers", 1, "--orientation", "measured", "-q"]
+    assert main(["rectify", str(flown), str(other), "-o", str(tmp_path / "b.tif"), *map(str, words)]) == 0
 
 
 def test_stac_item_tells_when_lines_were_taken_and_cells_in_metres(flown, folder, capsys):
