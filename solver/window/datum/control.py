@@ -159,6 +159,11 @@ class ControlTests:
                 reasons.append(f"{'or' if reasons else 'either the control refused is wrong or'} tie points drift")
         return "; ".join(reasons)
 
+    @property
+    def differs_from_gnss(self) -> bool:
+        """Whether all control of the strip differs from the GNSS along an axis."""
+        return bool(self._differ)
+
     def fails(self, limit_m: float) -> bool:
         """Whether control and GNSS differ by so much that no sigma can be relied on.
 

@@ -20,6 +20,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from ...adjustment.drift_hypotheses import (
+    ALL,
     EACH,
     FALSE_ALARM,
     LEAST_AGE,
@@ -230,13 +231,19 @@ class DriftMonitor:
         """Time since the strip began, in units of the drift's."""
         return (now_s - self._start_s) / DRIFT_S
 
-    def test(self, now_s: float) -> None:
-        """Test with what is in the border, of all batches of the strip; the state is solved."""
+    def test(self, now_s: float, of_all: bool = True) -> None:
+        """Test with what is in the border, of all batches of the strip; the state is solved.
+
+        Parameters
+        ----------
+        of_all : whether a drift that all CCD lines share may be named; not where something else explains it
+        """
         self._tested_s, batches = now_s, self._mine(self._network.batches)
         cells = self._in_border(batches)
         border, found, factor = self._assembled(now_s, cells)
         scores = self._scores(now_s, batches, cells, border)
-        self.biased = self._suspicion.judge(now_s, scores, found, factor) if found else ()
+        named = self._suspicion.judge(now_s, scores, found, factor) if found else ()
+        self.biased = tuple(source for source in named if of_all or source.ccd != ALL)
         self._limit = self._suspicion.limit(factor)
         self._drift = None
         if self.biased:

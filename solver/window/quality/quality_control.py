@@ -77,7 +77,8 @@ class QualityControl:
                 self._control.strip_began()
             self._sources.take_in(now_s)
         if test:
-            self._sources.test(now_s)
+            # where control and GNSS are told to differ, that is why all tie points contradict one of them
+            self._sources.test(now_s, of_all=not self._control.differs_from_gnss)
         return self._sources.biased != before
 
     def look(self, now_s: float, length_s: float, fit: Fit, noise: Array) -> QualityFindings:

@@ -12,7 +12,7 @@ from ..state.batch import Batch
 from ..state.maker import BatchMaker, Draft
 from ..state.network import LiveNetwork
 from .disagreement import Disagreement
-from .entry import EntryEquations, disagreement
+from .entry import EntryEquations, JudgedLooks, disagreement
 from .first_ground import FirstGround
 from .snooping import admit
 from .ties import ON_ENTRY, contradicting, drop_weak, meet, set_apart
@@ -71,7 +71,10 @@ class Arrivals:
         if self._snoop:
             network.state.expect([batch.columns for batch in fresh])
             equations = [EntryEquations.of(batch, network.state) for batch in fresh]
-            self._newest.entered(point for of_batch in equations for point in disagreement(of_batch))
+            self._newest.entered(
+                (point for of_batch in equations for point in disagreement(of_batch)),
+                [JudgedLooks.of(batch, of_batch) for batch, of_batch in zip(fresh, equations, strict=True)],
+            )
             for batch, of_batch in zip(fresh, equations, strict=True):
                 update.refused += admit(batch, of_batch, network)
                 set_apart(batch, contradicting(batch, network.state, ON_ENTRY), network, update)

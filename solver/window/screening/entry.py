@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -90,6 +91,37 @@ def disagreement(equations: EntryEquations) -> list[tuple[float, int, bool]]:
         for s, n, more in zip(best, looks, spared, strict=True)
         if n > 1
     ]
+
+
+class JudgedLooks(NamedTuple):
+    """Looks at points with three or more, and which of them each point would be right without.
+
+    Attributes
+    ----------
+    time_s, ccd : (n,) of the looks
+    square : (n,) by how much the weighted squares of the point fall without it; chi-square, two degrees of freedom
+    wrong : (n,) whether that is decisively more than without any other look at its point
+    """
+
+    time_s: Array
+    ccd: IntArray
+    square: Array
+    wrong: Bools
+
+    @classmethod
+    def none(cls) -> JudgedLooks:
+        return cls(np.empty(0), np.empty(0, dtype=np.int64), np.empty(0), np.empty(0, dtype=bool))
+
+    @classmethod
+    def of(cls, batch: Batch, equations: EntryEquations) -> JudgedLooks:
+        """Of a batch that is not in the state, with all that is known of the orientation without it."""
+        _, loss, _ = equations.by_themselves
+        point, slot = batch.rays.point, equations.slot
+        many = equations.present.sum(axis=1)[point] > 2
+        ordered = np.sort(np.pad(loss, ((0, 0), (1, 0))), axis=1)
+        decided = ordered[:, -1] > ordered[:, -2] + DECISIVE
+        wrong = decided[point] & (np.argmax(loss, axis=1)[point] == slot)
+        return cls(batch.rays.time_s[many], batch.rays.ccd[many], loss[point, slot][many], wrong[many])
 
 
 @dataclass(frozen=True)

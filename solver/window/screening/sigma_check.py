@@ -161,7 +161,9 @@ class SigmaCheck:
         constant error of the trajectory makes the data as likely.
 
         It takes a while until all noise of looks has been found: so it is asked anew before the camera is blamed, and
-        more has to speak against the camera.
+        more has to speak against the camera. In the first seconds a wander that is larger than stated bends the
+        trajectory as another camera would, until it shows its own sigma: so errors of the camera are stated smaller
+        again, too.
         """
         calibration = self._network.calibration
         if not calibration.is_questioned or len(self._looks.controlled()) < LEAST_LOOKS:
@@ -175,6 +177,8 @@ class SigmaCheck:
             if not calibration.is_contradicted(now, unstated) or self._constants_instead(strip):
                 break
             calibration.state_larger(now)
+            self._network.state.solve()
+        if calibration.state_smaller():
             self._network.state.solve()
 
     def _constants_instead(self, strip: WindowStrip) -> bool:
@@ -314,7 +318,7 @@ class SigmaCheck:
                 if now[i] > 1.0
                 else f"sigmas: {name} is as stated"
             )
-            if name == CALIBRATION:
+            if name == CALIBRATION and now[i] > 1.0:
                 self.events.append(
                     f"camera: looks are off its calibration by {calibration.worst(self._network.camera)}"
                 )

@@ -19,6 +19,9 @@ QUESTIONED = 1e-3
 LEAST, MOST = 1.5, 3.0
 #: Factors that are tried for the likelihood. Tuned.
 BANK = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+#: Sigmas that were stated larger are stated smaller again where twice the logarithm of the likelihood of the data rises
+#: by so much. Tuned.
+CLEARLY_LESS = 4.0
 #: Combinations of parameters count of which the observations say so much, as a share of the a-priori variance: where
 #: they say hardly anything nothing speaks against the sigma either. Tuned: the sigmas of a camera 100 px off are far
 #: from what is stated, so that looks say little of them at first; with a share of some per cent it is not followed.
@@ -36,7 +39,7 @@ class LiveCalibration(KnownBeforehand):
 
     def __init__(self, parameters: SelfCalibration | None, state: WindowState) -> None:
         super().__init__(np.empty(0) if parameters is None else parameters.apriori_sigma, state)
-        self.parameters, self.factor = parameters, 1.0
+        self.parameters, self.factor, self._stated = parameters, 1.0, self.sigma
         names = () if parameters is None else parameters.unknown_names
         questioned = () if parameters is None else parameters.questioned_names
         self._questioned = np.array([name in questioned for name in names], dtype=bool)
@@ -67,6 +70,20 @@ class LiveCalibration(KnownBeforehand):
         self.restate(np.where(self._questioned, factor * self.sigma, self.sigma))
         self.factor *= factor
 
+    def state_smaller(self) -> bool:
+        """State the sigmas smaller again, but not smaller than at first, where that makes the data clearly more likely;
+        whether it does."""
+        if self.factor == 1.0:
+            return False
+        factors = np.maximum(self.factor / np.array(BANK), 1.0)
+        cost = self._costs(factors / self.factor)
+        best = int(np.argmin(cost))
+        if best == 0 or cost[0] - cost[best] < CLEARLY_LESS:
+            return False
+        self.factor = float(factors[best])
+        self.restate(np.where(self._questioned, self.factor, 1.0) * self._stated)
+        return True
+
     def _test(self, variance: float) -> tuple[float, int]:
         """Chi-square value of what has been found, and its degrees of freedom."""
         found, unseen = self._found()
@@ -75,10 +92,15 @@ class LiveCalibration(KnownBeforehand):
     def gain(self) -> float:
         """By how much minus twice the logarithm of the likelihood of the data falls where the sigmas are stated as much
         larger as is likely best."""
-        found, unseen = self._found()
-        variance = np.square(BANK)[:, None] + unseen
-        cost = (found**2 / variance + np.log(variance)).sum(axis=1)
+        cost = self._costs(np.array(BANK))
         return float(cost[0] - cost.min())
+
+    def _costs(self, factors: Array) -> Array:
+        """Minus twice the logarithm of the likelihood of the data (f,), but for a constant, with these factors (f,) on
+        the sigmas as they are now."""
+        found, unseen = self._found()
+        variance = np.square(factors)[:, None] + unseen
+        return (found**2 / variance + np.log(variance)).sum(axis=1)
 
     def _found(self) -> tuple[Array, Array]:
         """What the observations alone say of independent combinations (m,) of those that are questioned, in units of

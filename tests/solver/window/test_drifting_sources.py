@@ -27,6 +27,7 @@ from triline.solver.simulation.window_study import (
 )
 from triline.solver.window.block import archive
 from triline.solver.window.block.backward import LeftPoints
+from triline.solver.window.datum.control import ControlTests
 from triline.solver.window.datum.drift_monitor import DRIFT_S, DriftMonitor
 from triline.solver.window.datum.drifts import Compensation, Named, estimated, of_block
 from triline.solver.window.results import AdjustedPoint, Look, WindowOptions
@@ -264,6 +265,15 @@ def test_a_source_that_drifts_as_a_whole_is_named_and_the_good_one_never_alone(f
     for _, sources in alarms:
         assert ("matcher-2", ALL) in sources[0].suspects
     assert orientation_errors(simulation, result.whole).nees.mean() < 3.0
+
+
+def test_no_drift_of_all_lines_is_named_where_control_and_gnss_differ(flight, monkeypatch):
+    """All tie points contradict one of them then. With control 1.5 m off they were named as drifting for a while."""
+    monkeypatch.setattr(ControlTests, "differs_from_gnss", property(lambda _: True))
+    simulation, poses = flight
+    second = _with_sources(monkeypatch, simulation)
+    _, alarms = _fly(_shifted(simulation, _drifting(0.0, 0.05), ALL, second), poses)
+    assert not any(source.ccd == ALL for _, sources in alarms for source in sources)
 
 
 @pytest.mark.study

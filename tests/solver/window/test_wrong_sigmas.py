@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from triline.solver.adjustment.reliability import HEAVY_TAILS
-from triline.solver.camera.self_calibration import focal_length
+from triline.solver.camera.self_calibration import focal_length, left_by_calibration
 from triline.solver.models.base import ATTITUDE_WANDER, CONSTANT, OFFSET, POSITION_WANDER, SHIFT, WANDERS, error_groups
 from triline.solver.models.slow_errors import SlowErrors
 from triline.solver.models.wander import GLOBALS
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.misspecified_study import OBSERVED, ROWS, SETTINGS
+from triline.solver.simulation.misstated import World
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import (
     adjust_online,
@@ -25,9 +26,10 @@ from triline.solver.simulation.window_study import (
     orientation_errors,
     point_errors,
 )
-from triline.solver.window.quality.light import GOOD
+from triline.solver.window.quality.light import BADLY_CALIBRATED, GOOD
 from triline.solver.window.results import TAKEN_BACK, WindowOptions
 from triline.solver.window.screening.disagreement import ENOUGH, RIGHT, Disagreement, variance_of_most
+from triline.solver.window.screening.entry import JudgedLooks
 from triline.solver.window.screening.kept_wanders import KeptWanders
 from triline.solver.window.screening.likelihood import (
     FROM_STRIP_TO_STRIP_LOG,
@@ -501,6 +503,61 @@ def test_all_points_that_come_at_once_tell(camera_network):
     assert camera_network.sigmas.disagreement == 1.0
     newest.entered((s, 1, True) for s in ratios[-40:])  # nothing older is left of them than of any others
     assert camera_network.sigmas.disagreement > 2.0
+
+
+def judged(wrong: float, second: int = 0, lines: tuple[int, ...] = (0, 1, 2)) -> JudgedLooks:
+    """Ten looks a second on each of three CCD lines, some of them wrong: a share anywhere, and eight of ten in one
+    second on some of the lines."""
+    rng = np.random.default_rng(2)
+    time_s, ccd = np.repeat(np.arange(10.05, 30.0, 0.1), 3), np.tile([0, 1, 2], 200)
+    spoilt = (np.floor(time_s) == second) & np.isin(ccd, lines)
+    out = rng.uniform(size=600) < np.where(spoilt, 0.8, wrong)
+    return JudgedLooks(time_s, ccd, np.where(out, 900.0, 1.0) * rng.chisquare(2, 600), out)
+
+
+def test_mismatches_that_come_singly_do_not_make_tests_wider(camera_network):
+    newest = Disagreement(camera_network.sigmas)
+    newest.entered((), [judged(0.15)])
+    assert camera_network.sigmas.disagreement == 1.0
+    newest.entered((), [judged(0.0, 20, (1,))])  # of one CCD line: it is that line
+    assert camera_network.sigmas.disagreement == 1.0
+
+
+def test_a_second_most_of_whose_looks_are_wrong_makes_tests_wider(camera_network):
+    newest = Disagreement(camera_network.sigmas)
+    looks = judged(0.05, 20)
+    for part in np.array_split(np.argsort(looks.ccd, kind="stable"), 7):  # as the points become complete
+        newest.entered((), [JudgedLooks(*(array[part] for array in looks))])
+    assert camera_network.sigmas.disagreement == pytest.approx(30.0, rel=0.3)
+    later = JudgedLooks(np.array([46.5]), np.array([0]), np.ones(1), np.zeros(1, dtype=bool))
+    newest.entered((), [later])
+    assert camera_network.sigmas.disagreement == 1.0
+
+
+def test_an_attitude_that_jumps_for_seconds_is_questioned_and_its_looks_stay():
+    """By 0.02 deg for 5 s: 18 % of the looks were taken for mismatches, and the sigmas were too small by half."""
+    simulation = simulate(replace(PLAN, strip_s=30.0), 4, RTK, OBSERVED)
+    middle = np.abs(simulation.attitude_time_s - simulation.flight.strip_times_s[0].mean()) < 2.5
+    jumped = simulation.attitude_rpy + np.where(middle[:, None], np.radians(0.02), 0.0)
+    simulation = replace(simulation, attitude_rpy=jumped)
+    online = adjust_online(simulation, navigate(simulation), OPTIONS, live=False, update_s=1.0)
+    assert rejected(online) < 0.02 * len(simulation.images)
+    assert orientation_errors(simulation, online.whole).nees.mean() < 1.6
+    assert point_errors(simulation, online.whole_points).nees.mean() < 1.6
+
+
+def test_a_large_wander_is_taken_for_the_camera_no_longer_than_it_could_be():
+    """Six times as large: in the first ten seconds the camera explained it as well, and stayed blamed."""
+    simulation = simulate(replace(PLAN, strip_s=25.0), 1, RTK, OBSERVED, world=World(wander_factor=6.0))
+    online = adjust_online(
+        simulation, navigate(simulation), OPTIONS, left_by_calibration(PLAN.camera), live=False, update_s=1.0
+    )
+    calibration = online.window.network.calibration
+    told = [float(e.split()[6]) for e in online.events if e.startswith("sigmas: calibration of the camera is")]
+    assert max(told) > BADLY_CALIBRATED and calibration.factor < 4.0
+    assert told[-1] == pytest.approx(calibration.factor, rel=0.05)
+    larger = calibration.sigma / left_by_calibration(PLAN.camera).apriori_sigma
+    assert larger[0] == 1.0 and larger[1:] == pytest.approx(calibration.factor)  # the focal length is not questioned
 
 
 def test_a_few_points_say_nothing(camera_network):
