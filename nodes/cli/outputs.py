@@ -95,6 +95,31 @@ def refuse_unless_picture(path: Path) -> None:
         raise UserError(f"--plot {path}: wanted a name that ends in .png, .svg or .pdf")
 
 
+#: Ends of names that say a format: of rasters, tables, vectors, pages and what this program writes itself.
+_FORMATS = {
+    *(".asc", ".bil", ".bip", ".bmp", ".bsq", ".dat", ".dem", ".ecw", ".gif", ".grd", ".h5", ".hdr", ".hgt", ".img"),
+    *(".j2k", ".jp2", ".jpeg", ".jpg", ".mbtiles", ".nc", ".ntf", ".pgm", ".png", ".ppm", ".raw", ".sid", ".tif"),
+    *(".tiff", ".vrt", ".webp", ".xyz", ".zarr"),
+    *(".csv", ".dxf", ".geojson", ".gpkg", ".html", ".json", ".kml", ".kmz", ".las", ".laz", ".mcap", ".parquet"),
+    *(".pdf", ".rrd", ".shp", ".svg", ".toml", ".txt", ".xml", ".zip"),
+}
+
+
+def refuse_other_format(path: Path | str | None, written: str, *endings: str, more: str = "") -> None:
+    """Raise UserError where the end of a name says another format than what is written; asked before the work.
+
+    Parameters
+    ----------
+    written : what is written, for people
+    endings : that say it; a name without an ending, or with one that says no format, is good as well
+    more : is said behind what was wanted
+    """
+    ending = "" if path is None else Path(path).suffix.lower()
+    if ending in _FORMATS and ending not in endings:
+        wanted = " or ".join(filter(None, (", ".join(endings[:-1]), endings[-1])))
+        raise UserError(f"{path}: {written} is written, wanted a name that ends in {wanted}{more}")
+
+
 def refuse_folder_of_inputs(folder: Path) -> None:
     """Raise UserError where a result would be written among the files of a block or of a flight, over some of them."""
     # readers that only commands with folders of results need

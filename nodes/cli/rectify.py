@@ -13,7 +13,7 @@ from ...solver.orthoimage.resampling import TAPS
 from ...solver.rectification.kernels import TAPS as IMAGE_TAPS
 from ..batch.rectification import ORIENTATIONS, Rectification, Rectified, line_blocks, project_frame
 from ..errors import UserError
-from ..formats.geotiff import write_orthoimage
+from ..formats.geotiff import is_virtual, write_orthoimage
 from ..formats.importable import refuse_importable
 from ..formats.json_text import json_text
 from ..formats.new_file import refuse_unless_writable
@@ -21,6 +21,7 @@ from ..formats.projection import notes_of_map
 from ..recording.remote import path_of
 from . import rectify_image, rectify_mosaic
 from .damage import tell_damage, tell_other_camera, tell_other_frame
+from .outputs import refuse_other_format
 from .progress import progress
 from .rectify_recording import cells_of, prepared
 
@@ -38,7 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "input", type=path_of, metavar="INPUT", nargs="+",
         help="recording with image lines, or with --sensor an image; with --mosaic several, and finished orthoimages",
     )  # fmt: skip
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="GeoTIFF to write")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FILE", help="GeoTIFF to write (--mosaic: or .vrt)"
+    )
     parser.add_argument(
         "--orientation", choices=tuple(ORIENTATIONS), help="of the lines (default: the best there is, in this order)"
     )
@@ -81,6 +84,7 @@ def _only(given: list[Any], what: str = "") -> Any:
 
 
 def run(args: argparse.Namespace) -> int:
+    _refuse_other_formats(args)
     if args.mosaic:
         return rectify_mosaic.run(args)
     args.input = _only(args.input)
@@ -131,6 +135,17 @@ def run(args: argparse.Namespace) -> int:
     tell_other_frame("rectify", recording.reader)
     tell_other_camera("rectify", recording.reader)
     return 0
+
+
+def _refuse_other_formats(args: argparse.Namespace) -> None:
+    for path in (args.output, args.sigma, args.mask, args.source):
+        if args.mosaic:
+            refuse_other_format(path, "a GeoTIFF or a virtual raster", ".tif", ".tiff", ".vrt")
+        else:
+            more = "; --mosaic writes virtual rasters" if is_virtual(Path(path or "")) else ""
+            refuse_other_format(path, "a GeoTIFF", ".tif", ".tiff", more=more)
+    refuse_other_format(args.seam_lines, "GeoJSON", ".geojson", ".json")
+    refuse_other_format(args.stac, "JSON", ".json", ".geojson")
 
 
 def _check(args: argparse.Namespace) -> None:

@@ -36,6 +36,7 @@ from ..simulator.flight_settings import (
 )
 from ..simulator.simulator import BEFORE_NS, Simulator
 from ..simulator.world_settings import HELP, world_terms
+from .outputs import refuse_other_format
 from .progress import progress
 
 EXAMPLE = """triline simulate -o flight.mcap --sensor ads40 --strips 6 --cross 2 --seconds 60 --seed 1
@@ -118,6 +119,7 @@ def run(args: argparse.Namespace) -> int:
     epoch_ns = _utc_ns(args.epoch) if args.epoch else flight.epoch_ns or DEFAULT_EPOCH_NS
     if args.dem is not None and Path(args.dem).resolve() == Path(args.output).resolve():
         raise UserError("-o, --dem: wanted different files")
+    refuse_other_format(args.dem, "a GeoTIFF", ".tif", ".tiff")
     simulator = Simulator(flight.simulation, flight.imager)
     with (
         new_file(Path(args.output)) as part,

@@ -542,9 +542,10 @@ def test_no_output_is_written_over_what_is_read(block, tmp_path, capsys):
     folder = tmp_path / "flights"
     folder.mkdir()
     (folder / "day1.mcap").write_bytes(b"a recording")
+    (tmp_path / "same.tif").symlink_to(folder / "day1.mcap")
     for words in (
         [tmp_path / "a.source.tif", "--mosaic", "-o", tmp_path / "a.tif"],
-        [folder, "--mosaic", "-o", tmp_path / "b.tif", "--source", folder / "day1.mcap"],
+        [folder, "--mosaic", "-o", tmp_path / "b.tif", "--source", tmp_path / "same.tif"],
     ):
         assert main(["rectify", *map(str, words)]) == 1
         assert "the output would overwrite" in capsys.readouterr().err

@@ -43,6 +43,37 @@ def test_a_plot_of_another_kind_is_refused_before_the_work(study, work, tmp_path
     assert capsys.readouterr().err == f"triline study: --plot {plot}: wanted a name that ends in .png, .svg or .pdf\n"
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("-o x.jpg", "x.jpg: a GeoTIFF is written, wanted a name that ends in .tif or .tiff"),
+        (
+            "-o x.vrt",
+            "x.vrt: a GeoTIFF is written, wanted a name that ends in .tif or .tiff; --mosaic writes virtual rasters",
+        ),
+        ("-o x.tif --sigma s.PNG", "s.PNG: a GeoTIFF is written, wanted a name that ends in .tif or .tiff"),
+        ("--sensor x.RPB -o x.jp2", "x.jp2: a GeoTIFF is written, wanted a name that ends in .tif or .tiff"),
+        ("--sensor x.RPB -o x --mask m.img", "m.img: a GeoTIFF is written, wanted a name that ends in .tif or .tiff"),
+        (
+            "--mosaic -o x.png",
+            "x.png: a GeoTIFF or a virtual raster is written, wanted a name that ends in .tif, .tiff or .vrt",
+        ),
+        ("--mosaic -o x --seam-lines s.tif", "s.tif: GeoJSON is written, wanted a name that ends in .geojson or .json"),
+        ("--mosaic -o x.vrt --stac s.xml", "s.xml: JSON is written, wanted a name that ends in .json or .geojson"),
+        # what is good: it is the input that is not there
+        ("-o x.TIFF", "in.mcap: no such file"),
+        ("-o x", "in.mcap: no such file"),
+        ("-o x.v2", "in.mcap: no such file"),
+        ("--mosaic -o x.vrt --sigma s.vrt", "in.mcap: no such file"),
+    ],
+)  # fmt: skip
+def test_rectify_refuses_a_name_that_says_another_format(words, said, tmp_path, monkeypatch, capsys):
+    """It wrote a GeoTIFF under the name of a picture."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["rectify", "in.mcap", *words.split()]) == 1
+    assert capsys.readouterr().err == f"triline rectify: {said}\n"
+
+
 def test_a_writer_that_fails_names_the_file_and_not_its_part(tmp_path):
     """`triline view --rrd x.rrd` spoke of `.x.rrd.part` in a folder without permission."""
     with pytest.raises(UserError) as refused, new_file(tmp_path / "runs.csv") as part:
