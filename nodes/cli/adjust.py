@@ -87,6 +87,12 @@ LEAST_RAYS = 100
 #: Up to so many segments or fixes a strip are not checked against the number of rays.
 FEW = 20
 
+#: Note where the image sigma is asked for by itself before it is asked for with the others.
+REWEIGHTED_TWICE = (
+    "--reweight beside --variance-components: these estimate the image sigma, too, and begin with one that took what "
+    "is wrong with the others; wanted --variance-components alone"
+)
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
@@ -261,6 +267,9 @@ def _run_block(args: argparse.Namespace, paths: Sequence[Path], dem: Mapping[str
         block = replace(block, notes=(*block.notes, "refraction taken off the image points"))
     if block.apriori.then and args.then is None:
         block = replace(block, notes=(*block.notes, UNUSED))
+    tested = args.selfcal not in ("none", LEFT)  # between the two, with the image sigma that the first one found
+    if args.reweight and args.variance_components and not tested and args.then is None:
+        block = replace(block, notes=(*block.notes, REWEIGHTED_TWICE))
     job = job_of(args, block)
     if joined is not None:
         jobs = [job_of(args, own) for own in recordings]

@@ -540,6 +540,21 @@ def test_everything_at_once_with_pictures(folder, tmp_path):
         assert (tmp_path / name).stat().st_size > 20_000
 
 
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--reweight"], False),
+        (["--variance-components"], False),
+        (["--reweight", "--variance-components"], True),
+        (["--reweight", "--variance-components", "--selfcal", "tls18"], False),  # tested between the two
+    ],
+)
+def test_an_image_sigma_that_is_asked_for_twice_is_told(folder, capsys, options, told):
+    """The variance components begin with what it took of other groups' errors."""
+    code, out, _ = adjust(folder, "-q", *options, capsys=capsys)
+    assert code == 0 and ("note: --reweight beside --variance-components: " in out) is told
+
+
 def test_control_that_nobody_measured_and_keys_that_nobody_knows_are_told(folder, tmp_path, capsys):
     block = tmp_path / "block"
     shutil.copytree(folder, block)
