@@ -49,8 +49,7 @@ def load(path: str | Path | None, known: Iterable[str] | None = None) -> Tables:
     if path is None:
         return {}
     try:
-        with open(path, "rb") as file:
-            tables = tomllib.load(file)
+        tables = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: not a TOML file: {error}") from None
     except RecursionError:
@@ -114,7 +113,7 @@ def raster_of_heights(path: Path) -> tuple[Path, str | None]:
 def _dem(path: Path, wanted: tuple[str, ...]) -> dict[str, Any]:
     """What ``[dem]`` states, as settings of the adjuster; some keys are wanted, or none and not even the table."""
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8")).get("dem")
+        table = tomllib.loads(path.read_text(encoding="utf-8-sig")).get("dem")
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path}: not a TOML file: {error}") from None
     if table is None and not wanted:

@@ -21,6 +21,7 @@ from .avirisng import is_avirisng, read_avirisng
 from .block_folder import is_block_folder, read_block
 from .block_images import with_block_images
 from .block_messages import block_messages, not_carried
+from .byte_order_mark import without_mark
 from .envi_image import is_envi_image
 from .geocal_xml import kind_of, read_tie_points
 from .gps_time import GPS_EPOCH_S, WEEK_S
@@ -143,7 +144,7 @@ def kind_of_path(path: Path) -> str:
     if path.stat().st_size == 0:
         raise UserError(f"{path}: empty, wanted one of: {', '.join(KINDS)}")
     with open(path, "rb") as file:
-        head = file.read(512)
+        head = without_mark(file.read(512))
     if head.startswith(b"\x89MCAP0\r\n") or (head.startswith(b"SQLite format 3\0") and path.suffix == ".db3"):
         return "ros2"
     if is_avirisng(path):

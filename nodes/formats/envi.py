@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import UserError
+from .byte_order_mark import read_latin
 
 
 def read_header(path: Path) -> dict[str, str]:
@@ -17,7 +18,7 @@ def read_header(path: Path) -> dict[str, str]:
     ------
     UserError : not an ENVI header
     """
-    text = path.read_text(encoding="latin-1")
+    text = read_latin(path)
     if not text.lstrip().startswith("ENVI"):
         raise UserError(f"{path}:1: not an ENVI header, wanted 'ENVI' in the first line")
     header: dict[str, str] = {}

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import UserError
+from .byte_order_mark import without_mark
 from .envi import header_integer, header_of, read_header
 from .grey_image import ImageFile
 
@@ -51,7 +52,7 @@ def is_envi_image(path: Path) -> bool:
     if header is None or not header.is_file():
         return False
     with open(header, "rb") as file:
-        return file.read(16).lstrip().startswith(b"ENVI")
+        return without_mark(file.read(16)).lstrip().startswith(b"ENVI")
 
 
 def open_envi(path: Path) -> EnviImage:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from .byte_order_mark import without_mark
 from .frame_json import is_frame_json
 
 #: Bytes of a file that are looked at.
@@ -29,7 +30,7 @@ def other_kind(path: Path) -> str | None:
     if not path.is_file():
         return None
     with open(path, "rb") as file:
-        head = file.read(_HEAD)
+        head = without_mark(file.read(_HEAD))
     suffix, name = path.suffix.lower(), path.name
     for begin, packed in _PACKED.items():
         if head.startswith(begin):

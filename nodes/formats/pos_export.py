@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...solver.geometry.frames import CrsError
 from ..errors import UserError
+from .byte_order_mark import read_latin
 from .projection import Projection
 from .table import MOST_PROBLEMS, one_line
 from .track import NavigationTrack, checked, times_from_gps
@@ -43,7 +44,7 @@ def read_pos_export(path: Path, day: date | None = None) -> NavigationTrack:
         value that is malformed (with line and column)
     """
     notes: list[str] = []
-    text = path.read_text(encoding="latin-1").splitlines()
+    text = read_latin(path).splitlines()
     place = next((i for i, line in enumerate(text) if re.match(r"\s*TIME\s*,", line)), None)
     if place is None:
         raise UserError(f"{path}: no line of column names, wanted 'TIME, ... ROLL, PITCH, HEADING, ...' of POS Export")

@@ -15,6 +15,7 @@ from ...solver.geometry.earth import R_en, geodetic_from_ecef
 from ...solver.navigation.inertial_data import GnssData
 from ..convert import LATEST_S
 from ..errors import UserError
+from .byte_order_mark import read_latin, without_mark
 from .gps_time import DAY_S, GPS_EPOCH_S, WEEK_S, utc_ns_from_gps
 from .table import MOST_PROBLEMS, one_line
 
@@ -34,7 +35,7 @@ _HEAD_BYTES = 16_384
 def is_rtklib(path: Path) -> bool:
     """Whether a text file begins like positions of RTKLIB."""
     with open(path, "rb") as file:
-        head = file.read(_HEAD_BYTES)
+        head = without_mark(file.read(_HEAD_BYTES))
     return (
         head.startswith(b"%") and re.search(rb"^%.*(latitude\(|x-ecef\(|e-baseline\()", head, re.MULTILINE) is not None
     )
@@ -51,7 +52,7 @@ def read_rtklib(path: Path, notes: list[str]) -> GnssData:
     UserError : no line of column names, columns, times or heights of another kind, a value that is malformed (with its
         line)
     """
-    text = path.read_text(encoding="latin-1").splitlines()
+    text = read_latin(path).splitlines()
     place = next((i for i, line in enumerate(text) if re.match(r"%.*(latitude\(|x-ecef\(|e-baseline\()", line)), None)
     if place is None:
         raise UserError(f"{path}: no line of column names, wanted '% GPST latitude(deg) longitude(deg) ..' of RTKLIB")

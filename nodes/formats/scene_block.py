@@ -244,7 +244,7 @@ def is_scene_block(folder: Path) -> bool:
     if not path.is_file():
         return False
     try:
-        return "scenes" in tomllib.loads(path.read_text(encoding="utf-8"))
+        return "scenes" in tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError):  # whoever reads it as a block says what is wrong with it
         return False
 

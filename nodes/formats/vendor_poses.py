@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..convert import LATEST_S
 from ..errors import UserError
+from .byte_order_mark import without_mark
 from .plausible import check_units
 from .table import MOST_PROBLEMS, one_line
 from .time_columns import same_day
@@ -24,7 +25,7 @@ _LCF = ("time", "roll", "pitch", "yaw", "longitude", "latitude", "altitude")
 def is_headwall(path: Path) -> bool:
     """Whether the first line is that of an ``imu_gps.txt``."""
     with open(path, "rb") as file:
-        names = file.readline(1024).decode("latin-1").strip().lstrip("\ufeff").split("\t")
+        names = without_mark(file.readline(1024)).decode("latin-1").strip().split("\t")
     return names[:3] == ["Roll", "Pitch", "Yaw"]
 
 

@@ -78,7 +78,7 @@ def _expanded(inputs: Iterable[str]) -> Iterator[str]:
         if not text.startswith("@"):
             yield text
             continue
-        for line in Path(text[1:]).read_text(encoding="utf-8").splitlines():
+        for line in Path(text[1:]).read_text(encoding="utf-8-sig").splitlines():
             if line.strip() and not line.lstrip().startswith("#"):
                 yield line.strip()
 

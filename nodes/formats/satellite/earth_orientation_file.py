@@ -36,7 +36,7 @@ def read_c04(path: Path) -> EarthOrientationTable:
     UserError : not such a file
     """
     rows = []
-    with open(path, encoding="ascii", errors="replace") as file:
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
         for number, line in enumerate(file, 1):
             if line.startswith("#") or not line.strip():
                 continue
@@ -56,7 +56,7 @@ def read_finals(path: Path) -> EarthOrientationTable:
     UserError : not such a file
     """
     rows, predicted = [], np.inf
-    with open(path, encoding="ascii", errors="replace") as file:
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
         for number, line in enumerate(file, 1):
             if not line[58:68].strip():  # days without a prediction end the file
                 continue
