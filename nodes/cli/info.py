@@ -111,7 +111,7 @@ def _lines(s: dict[str, Any]) -> list[str]:
         lines.append(f"true world, not stated: {s['world']}")
     lines.append(f"{'topic':<24} {'messages':>9} {'rate':>9}  {'gaps':>5}  source")
     for row in s["topics"]:
-        rate = f"{row['rate_hz']:.1f}/s" if row["rate_hz"] else "-"
+        rate = f"{row['rate_hz']:.1f}/s" if row["rate_hz"] is not None else "-"
         sources = ", ".join(row["sources"])
         lines.append(f"{row['topic']:<24} {row['messages']:>9} {rate:>9}  {row['gaps']:>5}  {sources}")
     if "bytes_read" in s:

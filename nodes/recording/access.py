@@ -91,12 +91,12 @@ class Recording:
         return f"Recording({str(self.reader.path)!r}, {len(self.reader.channel_of)} messages)"
 
     def topics(self) -> pd.DataFrame:
-        """One row a topic: messages, first and last stamp, rate, sources, gaps."""
+        """One row a topic: messages, first and last stamp, rate (NaN where none is known), sources, gaps."""
         import pandas as pd  # takes longer to import than all the rest
 
         rows = topic_summaries(self.reader)
         table = pd.DataFrame([vars(row) for row in rows], columns=pd.Index(vars(rows[0]) if rows else ["topic"]))
-        return table.set_index("topic")
+        return table.astype({"rate_hz": float} if rows else {}).set_index("topic")
 
     def messages(self, *wanted: str) -> Iterator[Message]:
         """Decoded messages of some topics (of all where none are named) in the order of their stamps."""

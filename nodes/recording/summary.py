@@ -34,7 +34,7 @@ class TopicSummary:
     topic, type : names
     messages : how many
     first_ns, last_ns : stamps
-    rate_hz : mean rate between first and last stamp; 0 for fewer than two stamps, and for what nodes put out in bursts
+    rate_hz : mean rate between first and last stamp; None for fewer than two, and for what nodes put out in bursts
     sources : who published it
     gaps : messages missing by their numbers
     duplicates : messages whose number came before
@@ -46,7 +46,7 @@ class TopicSummary:
     messages: int = 0
     first_ns: int = 0
     last_ns: int = 0
-    rate_hz: float = 0.0
+    rate_hz: float | None = None
     sources: list[str] = field(default_factory=list)
     gaps: int = 0
     duplicates: int = 0
@@ -83,7 +83,7 @@ def topic_summaries(reader: RecordingReader) -> list[TopicSummary]:
     for row in by_topic.values():
         known = row.first_ns != 0 or row.topic in timed  # 0 of others: said before any time was known
         span_s = (row.last_ns - row.first_ns) / 1e9 if known else 0.0
-        row.rate_hz = (row.messages - 1) / span_s if span_s > 0 and row.topic not in IN_BURSTS else 0.0
+        row.rate_hz = (row.messages - 1) / span_s if span_s > 0 and row.topic not in IN_BURSTS else None
         row.sources.sort()
     return sorted(by_topic.values(), key=lambda row: (_place(row.topic), row.topic))
 

@@ -42,7 +42,7 @@ def analyse(flight: Flight, held: Holdings) -> dict[str, Any]:
     result["topics"] = {
         row.topic: {
             "messages": row.messages,
-            "rate_hz": row.rate_hz or None,
+            "rate_hz": row.rate_hz,
             "gaps": row.gaps,
             "unusable": _unusable(flight, row),
         }

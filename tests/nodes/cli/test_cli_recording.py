@@ -115,6 +115,15 @@ def test_stamps_from_zero_have_a_rate(capsys, tmp_path):
     assert code == 0 and json.loads(out)["topics"][0]["rate_hz"] == pytest.approx(5)
 
 
+def test_no_rate_is_known_of_one_message(capsys, tmp_path):
+    """The text had "-", the JSON 0.0."""
+    one = Message("sensor/gnss", 1_000_000_000, sample.body("sensor/gnss", 0), "test", 0)
+    path = write_recording(tmp_path / "one.mcap", [one])
+    row = json.loads(run(capsys, "info", path, "--json")[1])["topics"][0]
+    assert (row["messages"], row["rate_hz"]) == (1, None)
+    assert run(capsys, "info", path)[1].splitlines()[3].split() == ["sensor/gnss", "1", "-", "0", "test"]
+
+
 def test_a_strip_that_has_not_ended_has_no_number_of_lines(capsys, tmp_path):
     """Drivers say it at the end; it had "0 lines"."""
     strip = m.Strip(id="S1", first_line_time_ns=sample.EPOCH_NS, line_rate_hz=200.0)
