@@ -177,7 +177,9 @@ def _with_jumps(track: NavigationTrack, path: Path) -> NavigationTrack:
     step_s = np.diff(track.time_ns) * 1e-9
     velocity = np.diff(position, axis=0) / step_s[:, None]
     off = np.linalg.norm(np.diff(velocity, axis=0), axis=1) * step_s[1:]
-    bad = np.flatnonzero(off > np.maximum(MOST_ACCELERATION * step_s[1:] ** 2, 0.5))
+    # behind a gap, as between strips, there was more time to become another velocity than a step
+    apart_s = np.maximum(step_s[1:], 0.5 * (step_s[1:] + step_s[:-1]))
+    bad = np.flatnonzero(off > np.maximum(MOST_ACCELERATION * step_s[1:] * apart_s, 0.5))
     if not len(bad):
         return track
     first = bad[np.concatenate([[True], np.diff(bad) > 3])]

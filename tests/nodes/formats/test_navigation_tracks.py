@@ -162,6 +162,33 @@ def test_what_is_assumed_of_poses_without_accuracies_is_told(options, told, tmp_
 # ---- AVIRIS-NG
 
 
+def two_strips(gap_s: float, jump_m: float = 0.0) -> str:
+    """60 m/s eastwards and back at 10 Hz, with a step to the north within the second strip."""
+    rows = ["time_s,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg"]
+    for k in range(200):
+        metres = 6.0 * k if k < 100 else 6.0 * (200 - k)
+        north_m = (1000.0 if k >= 100 else 0.0) + (jump_m if k >= 150 else 0.0)
+        time_s = 1.79e9 + 0.1 * k + (gap_s if k >= 100 else 0.0)
+        lat, lon = 48.0 + north_m / 111_200, 9.0 + metres / 74_600
+        rows.append(f"{time_s:.1f},{lat:.9f},{lon:.9f},1500,0,0,{90 if k < 100 else 270}")
+    return "\n".join(rows) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("gap_s", "jump_m", "told"),
+    [
+        (120.0, 0.0, []),
+        (120.0, 5.0, ["two.csv: position jumps at 1 places, by 5.0 m at most, first at record 151"]),
+        (0.0, 0.0, ["two.csv: position jumps at 1 places, by 1000.2 m at most, first at record 101"]),
+    ],
+)
+def test_a_gap_between_strips_is_no_jump(tmp_path, gap_s, jump_m, told):
+    """The velocity across the gap is none that was flown: the first pose behind it was said to be 6 m off."""
+    path = tmp_path / "two.csv"
+    path.write_text(two_strips(gap_s, jump_m))
+    assert [note for note in read_trajectory_csv(path).notes if "jumps" in note] == told
+
+
 @needs_data
 def test_aviris_ng_poses():
     track = read_avirisng(AVIRIS_NG)
