@@ -14,6 +14,7 @@ import numpy as np
 from ...solver.geometry.measured_trajectory import POSE_GAP_S
 from ...solver.simulation.ground_points import shortest_coverage_s
 from ...solver.simulation.orbital_scene import ORBITAL_SENSORS
+from ...solver.simulation.real_motion import RealMotion
 from ...solver.simulation.scenario import Simulation
 from .. import convert
 from ..batch.rectification import true_relief
@@ -134,6 +135,8 @@ def run(args: argparse.Namespace) -> int:
     if args.dem is not None:
         write_heights(Path(args.dem), true_relief(flight.simulation.flight))
     result = _summary(flight, simulator.duration_s, args.output, 1 if given["seed"] is None else given["seed"], counts)
+    if flight.motion is not None and given["seconds"] is not None:
+        result["notes"] += _shorter(flight.motion, given["from"] or 0.0, given["seconds"])
     if args.json:
         print(json_text(result))
     elif not args.quiet:
@@ -236,14 +239,31 @@ def _summary(flight: SimulatedFlight, seconds: float, output: str, seed: int, co
     return result
 
 
+def _gap_s(time_s: np.ndarray) -> float:
+    """Longer without poses is a gap of a recorded motion: longer than nodes take for one, and than ten of its steps."""
+    return max(POSE_GAP_S, 10.0 * float(np.median(np.diff(time_s))))
+
+
 def _gaps(time_s: np.ndarray) -> list[str]:
-    """A line where the recorded motion has no poses for longer than nodes take for a gap, and than ten of its steps."""
+    """A line where the recorded motion has no poses for a while."""
     step = np.diff(time_s)
-    gaps = step[step > max(POSE_GAP_S, 10.0 * float(np.median(step)))]
+    gaps = step[step > _gap_s(time_s)]
     if not len(gaps):
         return []
     what = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
     return [f"the recorded motion has {what}, of {gaps.max():.1f} s at most: its path is interpolated there"]
+
+
+def _shorter(motion: RealMotion, from_s: float, wanted_s: float) -> list[str]:
+    """A line where the part of a recorded motion that was asked for begins or ends with a gap, or reaches beyond it."""
+    time_s = motion.trajectory.time_s
+    first, last = motion.first_time_s, motion.first_time_s + float(time_s[-1])
+    if max(first - from_s, from_s + wanted_s - last) <= _gap_s(time_s):
+        return []
+    return [
+        f"the recorded motion has poses for {last - first:.1f} of the {wanted_s:g} s that were asked for, from "
+        f"{first:.1f} to {last:.1f} s: it ends there, or has a gap"
+    ]
 
 
 def _left_out(simulation: Simulation, roles: Mapping[str, int]) -> list[str]:

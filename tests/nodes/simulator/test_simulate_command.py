@@ -491,6 +491,27 @@ def test_a_gap_in_a_motion_is_told(tmp_path, capsys):
         assert len(notes) == gaps and all("motion has 1 gap, of " in note for note in notes), notes
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ([], None),
+        (["--seconds", "20"], None),
+        (["--seconds", "38"], "23.9 of the 38 s that were asked for, from 0.0 to 23.9 s"),
+        (["--seconds", "29.55", "--from", "30"], "19.5 of the 29.55 s that were asked for, from 40.0 to 59.5 s"),
+        (["--seconds", "70", "--from", "10"], "53.9 of the 70 s that were asked for, from 10.0 to 63.9 s"),
+    ],
+)
+def test_a_motion_that_is_shorter_than_asked_for_is_told(tmp_path, capsys, words, told):
+    """It ended with the gap, or with the recorded flight, and nothing said so."""
+    rows = lively_track(tmp_path / "poses.csv", 64.0).read_text().splitlines()
+    (tmp_path / "two.csv").write_text("\n".join([*rows[:241], *rows[401:]]))
+    words = [*words, "--motion", str(tmp_path / "two.csv"), "--ground", "200", "--ties", "1", "--json"]
+    assert main(["simulate", "-o", str(tmp_path / "a.mcap"), *words]) == 0
+    notes = [note for note in json.loads(capsys.readouterr().out)["notes"] if "asked for" in note]
+    begin = "the recorded motion has poses for "
+    assert notes == ([] if told is None else [f"{begin}{told}: it ends there, or has a gap"])
+
+
 def test_motion_of_what_has_no_poses_is_refused_in_one_line(tmp_path, capsys):
     (tmp_path / "imu.csv").write_text("time_s\n")
     assert main(["simulate", "-o", str(tmp_path / "x.mcap"), "--motion", str(tmp_path)]) == 1
