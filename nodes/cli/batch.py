@@ -18,7 +18,7 @@ from ..errors import UserError
 from ..formats.json_text import json_text
 from ..formats.new_file import refuse_unless_folder
 from ..jobs.driver import Progress, add_recorded, drive, progress_of
-from ..jobs.inputs import sources
+from ..jobs.inputs import flown_twice, sources
 from ..jobs.plan import Plan, plans
 from ..jobs.pools import LocalPool, Pool
 from ..jobs.steps import STEPS, USUAL
@@ -68,13 +68,17 @@ def run(args: argparse.Namespace) -> int:
     options = _options(args.options, wanted)
     refuse_unless_folder(args.output)
     found = sources(args.inputs, args.output)
+    notes = flown_twice(found)
+    if not args.quiet:
+        for note in notes:  # before the work, which may take hours
+            print(f"triline batch: note: {plain(note)}", file=sys.stderr, flush=True)
     if args.list:
         return _list(plans(found, args.output, wanted, options), args)
     with locked(args.output):
         planned = plans(found, args.output, wanted, options)
         progress = progress_of(planned)
         lost = _work(planned, progress, workers, args) if progress.total else None
-        result = _results(planned, progress, args.output, time.monotonic() - begun)
+        result = _results(planned, progress, args.output, time.monotonic() - begun, notes)
     _tell(result, args)
     if lost:
         print(f"triline batch: {lost}", file=sys.stderr)
@@ -252,7 +256,9 @@ def _list(planned: Sequence[Plan], args: argparse.Namespace) -> int:
     return 0
 
 
-def _results(planned: Sequence[Plan], progress: Progress, out: Path, seconds: float) -> dict[str, Any]:
+def _results(
+    planned: Sequence[Plan], progress: Progress, out: Path, seconds: float, notes: list[str]
+) -> dict[str, Any]:
     """The tables and the page over all flights; returns what stands in them."""
     from ..report.batch_page import write_page
     from ..report.batch_rows import flight_rows, write_tables
@@ -266,6 +272,7 @@ def _results(planned: Sequence[Plan], progress: Progress, out: Path, seconds: fl
             "failed": len(progress.failed), "not_begun": progress.total - len(progress.outcomes),
         },
         "seconds": round(seconds, 3),
+        "notes": notes,
     }  # fmt: skip
     write_tables(out, result)
     write_page(out / "index.html", result)

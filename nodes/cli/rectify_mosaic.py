@@ -14,9 +14,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from ...schemas.envelope import Envelope
 from ...solver.camera.line_camera import LineCamera
 from ...solver.orthoimage.ground_grid import GroundGrid
 from ..batch.block_mosaic import (
@@ -50,6 +47,7 @@ from ..formats.projection import notes_of_map, unit_of
 from ..formats.stac import write_stac_item
 from ..recording.access import Recording
 from ..recording.reader import RecordingReader
+from ..recording.same_flight import beginning_alike
 from . import rectify_image
 from .damage import tell_damage, tell_other_camera, tell_other_frame
 from .heights_under import rasters_of_heights
@@ -233,21 +231,13 @@ def _kinds(args: argparse.Namespace) -> list[tuple[str, Path, str | None]]:
 def _refuse_one_flight_twice(paths: list[Path]) -> None:
     """Refuse a flight beside what was made of it: seams would run between its two orientations.
 
-    They begin with the same image lines: messages of one source and number, and the same bytes, since simulated flights
-    begin at one time.
+    They begin with the same image lines.
     """
-    begins: dict[tuple[str, Envelope, bytes], Path] = {}
-    for path in paths if len(paths) > 1 else ():
-        reader = RecordingReader(path)
-        lines = reader.select(["sensor/lines/*"])
-        _, first = np.unique(reader.channel_of[lines], return_index=True)
-        for raw in reader.raws(lines[first]):
-            other = begins.setdefault((raw.topic, raw.envelope, bytes(raw.data)), path)
-            if other != path:
-                raise UserError(
-                    f"{path} begins with the same image lines ({raw.topic}) as {other}: is it the same flight, "
-                    "as recorded and as processed? wanted one of them"
-                )
+    for path, other, topic in beginning_alike(paths if len(paths) > 1 else (), ["sensor/lines/*"]):
+        raise UserError(
+            f"{path} begins with the same image lines ({topic}) as {other}: is it the same flight, "
+            "as recorded and as processed? wanted one of them"
+        )
 
 
 def _refuse_without_effect(args: argparse.Namespace, kinds: set[str]) -> None:

@@ -7,12 +7,14 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 
 from ..errors import UserError
 from ..recording.remote import is_url, listed
+from ..recording.same_flight import beginning_alike, measured
 from .records import record_of
 from .steps import PROCESSED
 
@@ -65,6 +67,30 @@ def sources(inputs: Iterable[str], out: Path) -> list[Source]:
             raise UserError(f"{text}: no recording ({RECORDING}) there")
     names = _told_apart({path: name for path, (name, _, _) in found.items()})
     return [Source(names[path], path, size, modified) for path, (_, size, modified) in found.items()]
+
+
+def flown_twice(found: Iterable[Source]) -> list[str]:
+    """A line for each recording that holds the same sensor data as another one: a flight beside what was made of it.
+
+    Recordings elsewhere are not looked at, of which much would have to be fetched, nor those without a whole end.
+    """
+    alike: dict[tuple[tuple[str, int], ...], list[Path]] = {}
+    for path in (Path(source.path) for source in found if not is_url(source.path)):
+        alike.setdefault(tuple(measured(path).items()), []).append(path)
+    lines = []
+    for counts, paths in alike.items():
+        wanted = {topic for topic, _ in counts}
+        same: dict[tuple[Path, Path], set[str]] = {}
+        with suppress(UserError):  # what cannot be read its jobs say
+            for path, other, topic in beginning_alike(paths if len(paths) > 1 else (), sorted(wanted)):
+                same.setdefault((path, other), set()).add(topic)
+        lines += [
+            f"{path} holds the same sensor data as {other}: if they are one flight, as recorded and as processed, "
+            "it counts twice"
+            for (path, other), topics in same.items()
+            if topics == wanted
+        ]
+    return lines
 
 
 def _names_any(text: str, found: Iterable[str]) -> bool:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, Footer, McapRecord, Statistics
+from mcap.records import Channel, ChunkIndex, Footer, McapRecord, Statistics
 from numpy.typing import NDArray
 
 from . import mcap_scan as scan
@@ -129,14 +129,9 @@ def open_ranged(file: RemoteFile) -> Ranged:
     """
     size, buffer = file.size, file.buffer
     file.fetch([0, max(size - _END, 0)], [scan.RECORD_HEAD.size * 2, size])
-    end = size - len(scan.MAGIC)
-    if buffer[end:] != scan.MAGIC or end < scan.FOOTER_SIZE + len(scan.MAGIC):
-        raise NoIndexError("no end")
-    footer = _parse(buffer[end - scan.FOOTER_SIZE : end])
-    if not isinstance(footer, Footer) or not len(scan.MAGIC) <= footer.summary_start < end:
-        raise NoIndexError("no summary")
+    footer = _footer(buffer)
     file.fetch(footer.summary_start, size)
-    summary = list(_records(buffer[footer.summary_start : end - scan.FOOTER_SIZE]))
+    summary = _summary(buffer, footer)
     chunks = [record for record in summary if isinstance(record, ChunkIndex)]
     chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
     counted = [record.message_count for record in summary if isinstance(record, Statistics)]
@@ -156,6 +151,37 @@ def open_ranged(file: RemoteFile) -> Ranged:
     index = Index(number, place, channel, unknown, log, np.zeros(len(number), np.int64))
     starts = behind - np.array([c.compressed_size for c in chunks], dtype=np.int64)
     return Ranged(file, chunks, starts, behind, summary, footer, index, until)
+
+
+def counts_at_end(buffer: memoryview) -> dict[str, int]:
+    """How many messages a whole recording has on each topic, as its end says.
+
+    Raises
+    ------
+    NoIndexError : its end does not say it
+    """
+    summary = _summary(buffer, _footer(buffer))
+    counts: dict[str, int] = {}
+    topic = {record.id: record.topic for record in summary if isinstance(record, Channel)}
+    for record in summary:
+        for channel, n in record.channel_message_counts.items() if isinstance(record, Statistics) else ():
+            name = topic.get(channel, "")
+            counts[name] = counts.get(name, 0) + n
+    return counts
+
+
+def _footer(buffer: memoryview) -> Footer:
+    end = len(buffer) - len(scan.MAGIC)
+    if buffer[max(end, 0) :] != scan.MAGIC or end < scan.FOOTER_SIZE + len(scan.MAGIC):
+        raise NoIndexError("no end")
+    footer = _parse(buffer[end - scan.FOOTER_SIZE : end])
+    if not isinstance(footer, Footer) or not len(scan.MAGIC) <= footer.summary_start < end:
+        raise NoIndexError("no summary")
+    return footer
+
+
+def _summary(buffer: memoryview, footer: Footer) -> list[McapRecord]:
+    return _records(buffer[footer.summary_start : len(buffer) - len(scan.MAGIC) - scan.FOOTER_SIZE])
 
 
 def _of_chunk(number: int, chunk: ChunkIndex, data: memoryview) -> NDArray[np.int64]:

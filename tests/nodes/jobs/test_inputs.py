@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from triline.nodes.cli import main
 from triline.nodes.errors import UserError
-from triline.nodes.jobs.inputs import sources
+from triline.nodes.jobs.inputs import flown_twice, sources
 
 OUT = Path("results")
 
@@ -122,3 +123,24 @@ def test_two_that_would_share_a_folder_are_refused(season):
         Path(name).write_bytes(b"x")
     with pytest.raises(UserError, match="would have the folder a_"):
         sources(["s"], OUT)
+
+
+def test_a_flight_beside_what_was_processed_of_it_is_told(flown, adjustable, tmp_path, monkeypatch, capsys):
+    """It counted twice in the tables over all flights, without a word."""
+    monkeypatch.chdir(tmp_path)
+    plan = ("--seconds", "8", "--lead-in", "1", "--lead-out", "0.5", "--seed", "3", "--attitude-rate", "50")
+    assert main(["simulate", "-o", "other.mcap", *plan, "-q"]) == 0  # as many messages, at the same times
+    os.link(flown, "raw.mcap")
+    os.link(adjustable, "done.mcap")
+    Path("empty.mcap").write_bytes(b"")
+    Path("cut.mcap").write_bytes(flown.read_bytes()[:-20])
+    same = "holds the same sensor data as"
+    twice = [f"{Path('raw.mcap').resolve()} {same} {Path('done.mcap').resolve()}: if they are one flight, as recorded "
+             "and as processed, it counts twice"]  # fmt: skip
+    assert flown_twice(sources(["."], OUT)) == twice
+    assert flown_twice(sources(["raw.mcap", "other.mcap"], OUT)) == []
+    capsys.readouterr()
+    assert main(["batch", ".", "-o", "out", "--list"]) == 0
+    assert capsys.readouterr().err == f"triline batch: note: {twice[0]}\n"
+    assert main(["batch", ".", "-o", "out", "--list", "-q"]) == 0
+    assert capsys.readouterr().err == ""
