@@ -247,7 +247,8 @@ def _lines(summary: ProcessSummary, output: Path, seconds: float) -> list[str]:
     lines += [f"  {topic:<24} {n:>9} in" for topic, n in sorted(summary.inputs.items())]
     lines += [f"  {topic:<24} {n:>9} out" for topic, n in sorted(summary.outputs.items())]
     if summary.dropped:
-        counted = ", ".join(f"{n} {kind}" for kind, n in sorted(summary.dropped.items()))
+        words = {"impossible": "with impossible values"}
+        counted = ", ".join(f"{n} {words.get(kind, kind)}" for kind, n in sorted(summary.dropped.items()))
         lines += _wrapped(f"left out: {counted}", in_words(summary.dropped, summary.last_problems))
     if summary.notes:
         more = len(summary.notes) - 1

@@ -409,7 +409,8 @@ class _Line:
                 try:
                     body = self._decode(topic, data)
                 except ValueError as error:
-                    self._summary.drop("malformed", f"{topic} {sequence} of {channel.source!r}: {error}")
+                    kind = "impossible" if isinstance(error, codec.ImpossibleValues) else "malformed"
+                    self._summary.drop(kind, f"{topic} {sequence} of {channel.source!r}: {error}")
                     self._copy_passed()
                     self._leave_out()
                     continue

@@ -382,6 +382,27 @@ def test_process_skips_damage_and_bad_messages_with_a_count(tmp_path):
     assert [raw.envelope.stamp_ns for raw in out] == sorted(raw.envelope.stamp_ns for raw in out)
 
 
+def test_process_tells_impossible_values_from_bytes_that_are_no_message(capsys, tmp_path):
+    """Thirty fixes at a latitude of 200 deg were "30 malformed"; their bytes are as they should be."""
+    flight = tmp_path / "flight.mcap"
+    assert run(capsys, "simulate", "-o", flight, "--seconds", 4, "--lead-in", 1, "--lead-out", 0.5, "-q")[0] == 0
+    reader = RecordingReader(flight)
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        for raw in reader.raws(reader.select()):
+            if raw.topic == "sensor/gnss" and raw.envelope.sequence in (10, 11):
+                body = codec.parse(raw.topic, raw.data)
+                body.latitude = 200.0
+                raw = raw._replace(data=body.SerializeToString())
+            elif raw.topic == "sensor/gnss" and raw.envelope.sequence == 15:
+                raw = raw._replace(data=b"\xff\xff")
+            writer.write_raw(raw)
+    words = ("process", tmp_path / "a.mcap", "-o", tmp_path / "b.mcap", "--nodes", "navigator")
+    code, out, _ = run(capsys, *words)
+    assert code == 0 and "left out: 2 with impossible values, 1 malformed" in out
+    assert "latitude 200.0, wanted -90 to 90 degrees" in " ".join(out.split())  # lines are wrapped
+    assert json.loads(run(capsys, *words, "--json")[1])["dropped"] == {"impossible": 2, "malformed": 1}
+
+
 def test_nodes_may_take_and_give_image_lines(tmp_path):
     class Negative(Node):
         name, inputs, outputs = "negative", ("sensor/lines/*",), ("sensor/lines/*",)
