@@ -14,7 +14,7 @@ from ...solver.adjustment.block_data import BlockData
 from ...solver.adjustment.job import BatchResult, Job
 from ...solver.adjustment.layout import CorrectionSet
 from ...solver.adjustment.network import Control, Network
-from ...solver.adjustment.reliability import HEAVY_TAILS, NARROWLY, Reliability, reliability
+from ...solver.adjustment.reliability import HEAVY_TAILS, MISMATCHES, NARROWLY, Reliability, reliability
 from ...solver.adjustment.single_looks import single_looks
 from ...solver.adjustment.snooping import control_tests
 from ...solver.adjustment.statistics import (
@@ -471,12 +471,16 @@ def _test_notes(adjustment: Adjustment) -> list[str]:
         failing = int((result.rays.largest_w[result.solution.ray_weight > 0] > critical).sum())
         if failing > 0.01 * len(network.rays):
             notes.append(f"{failing} image points have |w| > {critical:g}; --snoop leaves out outliers")
-    narrowly = sum(r.reason == "snooping" and r.ray >= 0 and abs(r.w) < NARROWLY * critical for r in result.rejected)
+    failing = [abs(r.w) for r in result.rejected if r.reason == "snooping" and r.ray >= 0]
+    narrowly = sum(w < NARROWLY * critical for w in failing)
     if narrowly > HEAVY_TAILS * len(network.rays):
         notes.append(
             f"{100.0 * narrowly / len(network.rays):.0f} % of the image points fail narrowly: their errors have "
             "heavier tails than stated, sigmas of points are too small"
         )
+    elif len(failing) > MISMATCHES * len(network.rays):
+        share = f"{100.0 * len(failing) / len(network.rays):.0f} % of the image points contradict the others"
+        notes.append(f"{share} and are left out: more stay unseen at points of two rays, whose sigmas do not say it")
     w = control_tests(result.solution, result.cofactors)
     return notes + failing_note(network.point_ids, w, critical) + _deserted_control(result)
 

@@ -18,6 +18,9 @@ NARROWLY = 2.0
 #: Share of looks that fail narrowly which says that their errors have heavy tails, so that sigmas of points are too
 #: small. Tuned.
 HEAVY_TAILS = 0.02
+#: Share of looks that fail which says that others have stayed in unseen, at points of two looks: with 5 to 8 % of the
+#: looks wrong the normalised square error of points is up to 4. Tuned.
+MISMATCHES = 0.05
 
 #: Power of the test that marginal detectable errors are stated for.
 POWER = 0.80

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ...adjustment.drift_hypotheses import BiasedSource, Group
-from ...adjustment.reliability import CRITICAL_W, HEAVY_TAILS
+from ...adjustment.reliability import CRITICAL_W, HEAVY_TAILS, MISMATCHES
 from ...arrays import Array
 from ...models.base import ERROR_GROUPS
 from ...quantiles import chi2
@@ -83,7 +83,7 @@ class QualityFindings:
     ground_sigma_m, ground_protection_m : (4,) of the same on the ground, see `ground`; none where it is not known
     alert_limit_m : what protection levels on the ground stay below if the light is good; inf before the ground is seen
     standing : of the additional parameters
-    narrowly : share of looks that fail narrowly, see `Tails`
+    failing, narrowly : share of looks that fail, and of those that fail narrowly, see `Tails`
     disagreement, trajectory : see `SigmaFactors`; the latter of offset, of shift and drift, and of the wander of
         position: that of the attitude shows in the images, and its sigma is what these say
     attitude_at_most_s : see `SigmaFactors`. A shorter time than stated makes the light weak: it is found where looks
@@ -116,6 +116,7 @@ class QualityFindings:
     ground_protection_m: Array
     alert_limit_m: float
     standing: tuple[Standing, ...] = ()
+    failing: float = 0.0
     narrowly: float = 0.0
     disagreement: float = 1.0
     trajectory: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -165,6 +166,9 @@ def contradiction(s: QualityFindings) -> tuple[str, str] | None:
     if s.narrowly > HEAVY_TAILS:
         share = f"{100.0 * s.narrowly:.0f} % of the looks fail narrowly"
         return WEAK, f"{share}: their errors have heavier tails than stated, sigmas of points are too small"
+    if s.failing > MISMATCHES:
+        share = f"{100.0 * s.failing:.0f} % of the looks contradict the others"
+        return WEAK, f"{share} and are left out: more stay unseen at points of two looks, whose sigmas do not say it"
     doubts = [f"{n} {f:.1f} times" for n, f in zip(ERROR_GROUPS, s.trajectory, strict=False) if f > DOUBTED]
     if s.attitude_at_most_s < np.inf:
         doubts.append(f"the attitude wanders within {s.attitude_at_most_s:g} s")

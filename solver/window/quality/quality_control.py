@@ -110,6 +110,7 @@ class QualityControl:
         tied = int((rays >= 2).sum())
         known = np.concatenate([np.empty((0, 3)), *(b.control.weight for b in batches)]) > 0
         a, b, c = network.sigmas.apriori[[OFFSET, SHIFT, POSITION_WANDER]].tolist()
+        failing, narrowly = network.tails.shares(batches)
         found = QualityFindings(
             strip="" if strip is None else strip.id,
             length_s=length_s,
@@ -137,7 +138,8 @@ class QualityControl:
             ground_protection_m=protection[6:],
             alert_limit_m=self._alert_limit_m,
             standing=() if self._parameters is None else self._parameters.standing,
-            narrowly=network.tails.share(batches),
+            failing=failing,
+            narrowly=narrowly,
             disagreement=float(network.sigmas.disagreement),
             trajectory=(a, b, c),
             attitude_at_most_s=network.sigmas.attitude_at_most_s,

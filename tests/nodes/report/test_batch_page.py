@@ -55,7 +55,7 @@ def test_page_and_table_say_what_camera_flew_and_the_same_of_the_adjustment(tmp_
     """Check points of the adjustment stood on the page alone, and its columns also where nothing had been adjusted."""
     for adjusted in (False, True):
         rows = [flown_with("ads40", adjusted), flown_with("si-100", False)]
-        result = {"flights": rows, "jobs": {"failed": 0, "now": 2, "earlier": 0}, "seconds": 1.0}
+        result = {"flights": rows, "jobs": {"failed": 0, "now": 2, "earlier": 0}, "seconds": 1.0, "notes": []}
         write_page(tmp_path / "index.html", result)
         write_tables(tmp_path, result)
         page = (tmp_path / "index.html").read_text()

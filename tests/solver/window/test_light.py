@@ -155,6 +155,8 @@ DRIFT = BiasedSource("matcher-2", "B", 0.0, 0.5, 0.0, 0.02, 60.0, 36.0, 10.0)
         ({"points": 0, "refused": 0, "since_s": 5.0}, WEAK, "no tie points yet"),
         ({"narrowly": 0.04}, WEAK, "4 % of the looks fail narrowly: their errors have heavier tails than stated"),
         ({"narrowly": 0.015}, GOOD, ""),
+        ({"failing": 0.07}, WEAK, "7 % of the looks contradict the others and are left out: more stay unseen"),
+        ({"failing": 0.03, "narrowly": 0.01}, GOOD, ""),
         ({"sources": (DRIFT,)}, WEAK, "source matcher-2 on CCD B drift: line +0.00 px, sample +0.50 px"),
         ({"control": np.zeros(3)}, GOOD, "no control within 40 s; earlier control holds the datum"),
         (
