@@ -111,7 +111,7 @@ def test_a_recording_whose_head_is_lost_is_refused_with_the_reason(tmp_path, cap
     for *command, lacks in (
         ("process", cut, "-o", out, "it holds no message"),
         ("adjust", cut, "no message on configuration/camera; it cannot be adjusted as a block"),
-        ("rectify", cut, "-o", out, "no configuration/camera in it"),
+        ("rectify", cut, "-o", tmp_path / "out.tif", "no configuration/camera in it"),
         ("replay", cut, "nothing to play: no message in it"),
         ("export", "--per-line", out, cut, "no orientation in it; 'triline process' makes one from sensor data"),
         ("export", "--points", out, cut, "no message on point/object: `triline process` makes them"),
