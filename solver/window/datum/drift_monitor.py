@@ -242,8 +242,8 @@ class DriftMonitor:
         cells = self._in_border(batches)
         border, found, factor = self._assembled(now_s, cells)
         scores = self._scores(now_s, batches, cells, border)
-        named = self._suspicion.judge(now_s, scores, found, factor) if found else ()
-        self.biased = tuple(source for source in named if of_all or source.ccd != ALL)
+        suspected = self._suspicion.judge(now_s, scores, found, factor) if found else ()
+        self.biased = tuple(source for source in suspected if of_all or source.ccd != ALL)
         self._limit = self._suspicion.limit(factor)
         self._drift = None
         if self.biased:

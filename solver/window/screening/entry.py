@@ -65,8 +65,7 @@ def entry_weight(
             fails &= open_
         if not fails.any():
             break
-        ordered = np.sort(np.pad(loss, ((0, 0), (1, 0))), axis=1)
-        decided = fails & (ordered[:, -1] > ordered[:, -2] + DECISIVE)
+        decided = fails & _stands_out(loss)
         undecided = fails & ~decided
         active[undecided & (given == 0)] = False
         open_ &= ~undecided
@@ -91,6 +90,12 @@ def disagreement(equations: EntryEquations) -> list[tuple[float, int, bool]]:
         for s, n, more in zip(best, looks, spared, strict=True)
         if n > 1
     ]
+
+
+def _stands_out(loss: Array) -> Bools:
+    """Whether the look at each point (p, k) without which the squares fall most is decisively the bad one (p,)."""
+    ordered = np.sort(np.pad(loss, ((0, 0), (1, 0))), axis=1)
+    return np.asarray(ordered[:, -1] > ordered[:, -2] + DECISIVE)
 
 
 class JudgedLooks(NamedTuple):
@@ -118,9 +123,7 @@ class JudgedLooks(NamedTuple):
         _, loss, _ = equations.by_themselves
         point, slot = batch.rays.point, equations.slot
         many = equations.present.sum(axis=1)[point] > 2
-        ordered = np.sort(np.pad(loss, ((0, 0), (1, 0))), axis=1)
-        decided = ordered[:, -1] > ordered[:, -2] + DECISIVE
-        wrong = decided[point] & (np.argmax(loss, axis=1)[point] == slot)
+        wrong = _stands_out(loss)[point] & (np.argmax(loss, axis=1)[point] == slot)
         return cls(batch.rays.time_s[many], batch.rays.ccd[many], loss[point, slot][many], wrong[many])
 
 
