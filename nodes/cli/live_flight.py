@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...schemas.topics import may_be_dropped
+from ...schemas.topics import TOPICS, may_be_dropped
 from ..bus.bundle import ExpiryWatch, load_bundle
 from ..bus.folder_lock import locked
 from ..bus.processes import NodeGroup, NodeProcess
@@ -30,14 +30,21 @@ from ..step_driver import failure_words
 
 if TYPE_CHECKING:
     from ..bus.session import Bus
+    from ..monitor.monitor import Overview
     from ..monitor.sensor_watch import SensorWatch
 
 #: Nodes between sensors and orthoimages, in the order in which they are stopped.
 ESTIMATORS = ("navigator", "matcher", "adjuster", "rectifier")
+#: What tells only how far its publisher is: nothing is lost with one of them.
+ORDER_ONLY = frozenset(row.name for row in TOPICS if row.order_only)
 #: Longest wait until all nodes are there, s; one that has ended is told at once.
 READY_S = 60.0
 #: Longest wait after the flight until every node has processed all its messages.
 DRAIN_S = 15.0
+#: For so long the last messages of a node may be on their way to the others, s.
+ON_THE_WAY_S = 0.7
+#: A node that is stopped may work for so long on what it has held back, s.
+LAST_WORK_S = 45.0
 #: A sensor program that has ended by itself is started again after so long, s; twice as long each time, up to a minute.
 SENSOR_AGAIN_S, SENSOR_AGAIN_MOST_S = 3.0, 60.0
 
@@ -236,32 +243,44 @@ class LiveFlight:
     def _next_recording(self) -> Path:
         return self.folder / f"flight-{len(list(self.folder.glob('flight*.mcap'))) + 1}.mcap"
 
-    def _land(self, group: NodeGroup, overview: Any, show: Callable[[], None]) -> None:
-        """Wait until the nodes have processed all messages, then stop them along the data flow, the recorder last."""
+    def _land(self, group: NodeGroup, overview: Overview, show: Callable[[], None]) -> None:
+        """Stop the nodes along the data flow, the recorder last, each when it has worked off what has come to it.
+
+        What a node holds back for its order, until others go on or have been silent for long, it works off when it is
+        stopped: those that it waits for have ended by then.
+        """
         overview.ending = True
         self.say(ENDING)
         show()
         # messages long after the last image line, as the navigator's last second of smoothing, concern no image line
         late = self._lost_so_far(("late",))
         until = time.monotonic() + self.drain_s()
-        quiet_since = time.monotonic()
-        seen = -1
-        while time.monotonic() < until and time.monotonic() - quiet_since < 2.5:
-            time.sleep(0.1)
-            show()
-            received = sum(
-                t.received for s in overview.nodes.values() for t in s.topics if not t.topic.startswith("st")
-            )
-            busy = any(s.queued or s.lag_s > 0.5 for n, s in overview.nodes.items() if n in self.estimators)
-            if received != seen or busy:
-                seen, quiet_since = received, time.monotonic()
-        self._lost = late | self._lost_so_far(("gaps", "malformed", "dropped"))
         for name in (*self.estimators, "viewer", "recorder"):
             if name in group.processes:
-                group.processes[name].stop(30.0, self.folder if name == "recorder" else None)
-                time.sleep(0.7)  # its last messages still have to reach the other nodes
-                show()
+                node = group.processes[name]
+                self._wait_until_worked_off(node, overview, show, until)
+                node.stop(LAST_WORK_S, self.folder if name == "recorder" else None)
+        show()
+        self._lost = late | self._lost_so_far(("gaps", "malformed", "dropped"))
         self._failed = failed_nodes(overview.nodes)
+
+    @staticmethod
+    def _wait_until_worked_off(node: NodeProcess, overview: Overview, show: Callable[[], None], until: float) -> None:
+        """Return when three statuses in a row tell of no message received or worked off between them.
+
+        At ``until`` (of `time.monotonic`) it returns all the same, but leaves those before it in the data flow
+        `ON_THE_WAY_S` for their last messages.
+        """
+        until = max(until, time.monotonic() + ON_THE_WAY_S)
+        said, still, received, queued = overview.said[node.name], 0, -1, 0
+        while node.running and still < 2 and time.monotonic() < until:
+            time.sleep(0.1)
+            show()
+            if overview.said[node.name] > said:
+                said, status = overview.said[node.name], overview.nodes[node.name]
+                before, received = received, sum(t.received for t in status.topics if not t.topic.startswith("status/"))
+                still = still + 1 if received == before and status.queued >= queued else 0
+                queued = status.queued
 
     @contextmanager
     def _monitor(self, port: int) -> Iterator[tuple[Bus, Any, Callable[[], set[str]]]]:
@@ -318,12 +337,12 @@ class LiveFlight:
         return {**write_report(self.recording, report), "report": str(report)}
 
     def _lost_so_far(self, kinds: tuple[str, ...]) -> dict[str, int]:
-        """Messages that nodes lost, by kind; not those of the viewer, nor a status that a newer one replaced."""
+        """Messages that nodes lost, by kind; not those of the viewer, nor what a newer message has said as well."""
         sums: dict[str, int] = {}
         for name, status in self._overview.nodes.items():
             for topic in status.topics if name != "viewer" else ():
                 for kind in kinds:
-                    if getattr(topic, kind) and not may_be_dropped(topic.topic):
+                    if getattr(topic, kind) and not (may_be_dropped(topic.topic) or topic.topic in ORDER_ONLY):
                         sums[f"{name}: {topic.topic} {kind}"] = getattr(topic, kind)
             refused = sum(c.value for c in status.counters if c.name == "malformed" and name in self.estimators)
             if "malformed" in kinds and refused:  # what it could read, and could not use, among them

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 from triline.nodes.cli import main
 from triline.nodes.cli.demo import Demo
 from triline.nodes.cli.live_flight import LiveFlight, failed_nodes
+from triline.nodes.monitor.monitor import Overview
 from triline.schemas import messages as m
 
 RESULT = {"lost": {}, "waited_s": 0.0}
@@ -71,3 +74,35 @@ def test_a_file_is_neither_a_flight_nor_a_folder_of_results(tmp_path, capsys):
         assert main(words) == 1
         assert said in capsys.readouterr().err
     assert file.read_text() == "mine"
+
+
+def test_a_node_is_stopped_when_it_has_worked_off_what_came_however_much_it_holds_back():
+    """Lines that waited for a trajectory which had ended counted as work to do: every flight took ten seconds more."""
+    told = [(100, 604), (180, 604), (180, 420), (180, 404), (180, 404), (180, 404), (180, 404)]  # received, queued
+    overview = Overview()
+    node = SimpleNamespace(name="matcher", running=True)
+
+    def show():
+        received, queued = told[overview.said["matcher"]]
+        topics = [
+            m.TopicStatistics(topic="trajectory/smoothed", received=received),
+            m.TopicStatistics(topic="status/navigator", received=7 * overview.said["matcher"]),  # come for ever
+        ]
+        overview.take_status("matcher", m.NodeStatus(node="matcher", queued=queued, topics=topics))
+
+    LiveFlight._wait_until_worked_off(node, overview, show, time.monotonic() + 60.0)
+    assert overview.said["matcher"] == 6
+    node.running = False  # it has died: nothing to wait for
+    LiveFlight._wait_until_worked_off(node, overview, show, time.monotonic() + 60.0)
+    assert overview.said["matcher"] == 6
+
+
+def test_what_newer_messages_have_said_as_well_is_not_lost(tmp_path):
+    flight, overview = demo(tmp_path), Overview()
+    topics = [
+        m.TopicStatistics(topic=topic, gaps=1)
+        for topic in ("observation/progress", "status/matcher", "observation/tie", "sensor/lines/N")
+    ]
+    overview.take_status("adjuster", m.NodeStatus(node="adjuster", topics=topics))
+    flight._overview = overview
+    assert flight._lost_so_far(("gaps",)) == {"adjuster: observation/tie gaps": 1, "adjuster: sensor/lines/N gaps": 1}
