@@ -16,7 +16,7 @@ from ...solver.camera.line_camera import LineCamera
 from ...solver.geometry.frames import LocalFrame, known_crs
 from ...solver.geometry.rotation import quaternion_from_matrix
 from ...solver.orthoimage.error_band import GroundErrors
-from ...solver.orthoimage.ground_grid import GroundGrid, utm_of
+from ...solver.orthoimage.ground_grid import CellWindow, GroundGrid, utm_of
 from ...solver.orthoimage.heights_of_points import heights_of_points
 from ...solver.orthoimage.mosaic import Mosaic
 from ...solver.orthoimage.orientation import SAME_S, LineOrientation
@@ -45,6 +45,9 @@ ORIENTATIONS: dict[str, str] = {
 }
 #: Those that an adjustment has refined, with the camera that it estimated.
 REFINED = ("whole", "final", "live")
+#: Lines and pixels from one to the next whose rays tell whether a block of lines sees a part of the ground, and so many
+#: cells round it are looked at, besides a share of what the block sees: ground between those rays is nearly as high.
+LOOK_LINES, LOOK_RAYS, ROUND_CELLS, ROUND_SHARE = 16, 4, 16.0, 0.05
 #: Lines that are missing are left black, so that the others stay in their places, if there are not more than this.
 LARGEST_GAP = 5000
 
@@ -457,15 +460,21 @@ class Rectification:
     errors : besides those of the orientation; then the orthoimage has sigmas
     mosaic : makes what the cells go into, from the data type of the lines
     shadows : what the relief hides is left out; None = it shows what is seen beside it
+    part : the only cells that are wanted; None for all
+
+    Attributes
+    ----------
+    seen : corners (column, row) of what blocks of lines have been found to see, where a part is wanted
     """
 
     def __init__(
         self, camera: LineCamera, ccd: int, surface: Surface, grid: GroundGrid, resampling: str,
         orientation: Callable[[str], LineOrientation | None], reference_ns: int, factor: int = 1,
         errors: GroundErrors | None = None, mosaic: Callable[[np.dtype], Mosaic] = Mosaic,
-        shadows: Shadows | None = None,
+        shadows: Shadows | None = None, part: CellWindow | None = None,
     ) -> None:  # fmt: skip
-        self._mosaic, self.shadows = mosaic, shadows
+        self._mosaic, self.shadows, self.part = mosaic, shadows, part
+        self.seen: tuple[Array, Array] | None = None
         line = camera.lines[ccd]
         if line.pixels // factor < 2 <= line.pixels:
             most = grid.gsd / factor * (line.pixels // 2)
@@ -551,11 +560,29 @@ class Rectification:
         edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
         for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
             position, R = self._of_strip.at(time_s[begin:end])
+            lines = self.factor * int(usable[begin:end].sum())
+            if self.part is not None and not self._sees(self.part, position, R):
+                self._leave_out("beside the bounds", lines)
+                continue
             Q = None if self.errors is None else self._of_strip.covariance_at(time_s[begin:end])
             for patch in self._rectifier.add(first + begin, pixels[begin:end], usable[begin:end], position, R, Q):
                 self.result.mosaic.add(patch)
-            lines = self.factor * int(usable[begin:end].sum())
             self.result.strips[self._strip] = self.result.strips.get(self._strip, 0) + lines
+
+    def _sees(self, part: CellWindow, position_l: Array, R_lc: Array) -> bool:
+        """Whether lines see some of a part, or nearly."""
+        n, k = len(position_l), len(self.rays.sample)
+        lines, rays = _every(LOOK_LINES, n), _every(LOOK_RAYS, k)
+        direction = self.rays.ray_c[rays] @ np.swapaxes(R_lc[lines], 1, 2)
+        point, met = self.surface.meet(position_l[lines, None, :], direction)
+        if not met.any():
+            return False
+        cells = self.grid.cells_of_many(point[met])
+        low, high = cells.min(axis=0), cells.max(axis=0)
+        before = self.seen or (low, high)
+        self.seen = np.minimum(before[0], low), np.maximum(before[1], high)
+        around = ROUND_CELLS + ROUND_SHARE * float((high - low).max())
+        return part.meets(low - around, high + around)
 
     def _leave_out(self, reason: str, lines: int) -> None:
         assert self.result is not None
@@ -573,7 +600,14 @@ class Rectification:
     def finish(self) -> Rectified | None:
         """The orthoimage; None if no lines came."""
         self._close()
+        if self.result is not None and self.part is not None:
+            self.result.mosaic.clip(self.part)
         return self.result
+
+
+def _every(step: int, n: int) -> NDArray[np.int64]:
+    """Each step-th of n, with the first and the last one."""
+    return np.unique(np.append(np.arange(0, n, step), n - 1))
 
 
 def line_blocks(

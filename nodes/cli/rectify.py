@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ...solver.orthoimage.ground_grid import GroundGrid
 from ...solver.orthoimage.resampling import TAPS
 from ...solver.rectification.kernels import TAPS as IMAGE_TAPS
 from ..batch.rectification import ORIENTATIONS, Rectification, Rectified, line_blocks, project_frame
@@ -31,7 +33,7 @@ EXAMPLE = """triline rectify flight.mcap -o ortho.tif
   triline rectify day1.mcap day2.mcap --mosaic --dem heights.tif --sigma sigma.tif --workers 4 -o block.tif"""
 
 #: Options of an image that a recording takes, too.
-_OF_BOTH = ("dem_crs", "refraction", "occlusions", "sigma", "pixel_sigma", "height_sigma")
+_OF_BOTH = ("bounds", "dem_crs", "refraction", "occlusions", "sigma", "pixel_sigma", "height_sigma")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -96,10 +98,10 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     of = prepared(args, args.input)
     recording, camera, ccd, name = of.recording, of.camera, of.ccd, of.orientation_name
-    ground, grid, factor = of.ground, *cells_of(args, of)
+    ground, grid, factor, part = of.ground, *cells_of(args, of)
     work = Rectification(
         camera, ccd, of.surface, grid, args.resampling, of.of_strip, of.reference_ns, factor, of.errors,
-        shadows=of.shadows,
+        shadows=of.shadows, part=part,
     )  # fmt: skip
     with progress("rectifying", args.quiet or args.json) as told:
         for block in line_blocks(recording, camera.lines[ccd].id, args.strip, told):
@@ -110,6 +112,9 @@ def run(args: argparse.Namespace) -> int:
     done = work.finish()
     if done is None or not done.mosaic.tiles:
         left = ", ".join(f"{n} lines {why}" for why, n in (done.left_out if done else {}).items())
+        if part is not None and work.seen is not None:
+            wanted = rectify_image.words_of_bounds(args.bounds)
+            left = f"no line sees {wanted}; all lines together see {_extent(grid, *work.seen)}"
         if not left:
             left = "no lines of that strip" if done is None else f"no ray meets the ground: {ground}"
         raise UserError(f"{args.input}: nothing to rectify: {left}")
@@ -118,11 +123,12 @@ def run(args: argparse.Namespace) -> int:
         "TIFFTAG_IMAGEDESCRIPTION": f"{camera.name} {camera.lines[ccd].id}, {name} orientation, {ground}",
     }
     shape = write_orthoimage(
-        args.output, done.mosaic, grid, tags, sigma=None if args.sigma is None else Path(args.sigma)
+        args.output, done.mosaic, grid, tags, sigma=None if args.sigma is None else Path(args.sigma), part=part
     )
     result = {
         "output": str(args.output), "orientation": name, "ccd": camera.lines[ccd].id, "crs": grid.frame.crs,
-        "gsd": grid.gsd, "ground": ground, "resampling": args.resampling, "rows": shape[0], "columns": shape[1],
+        "gsd": grid.gsd, "bounds": args.bounds, "ground": ground, "resampling": args.resampling,
+        "rows": shape[0], "columns": shape[1],
         "pixels_together": factor, "camera_parameters": of.estimated, "camera": of.of_camera and str(of.of_camera),
         "sigma": args.sigma, "strips": done.strips, "left_out": done.left_out, "missed_rays": done.missed_rays,
         "hidden_cells": done.hidden_cells if args.occlusions else None,
@@ -178,6 +184,7 @@ def _check(args: argparse.Namespace) -> None:
     if args.dem is not None and args.height is not None:
         raise UserError("--height and --dem: wanted one of them")
     rectify_image.refuse_occlusions_of_level_ground(args)
+    rectify_image.refuse_empty_bounds(args)
     if args.dem is not None and len(args.dem) > 1:
         raise UserError("--dem: given more than once, which goes with --sensor only")
     if args.resampling not in TAPS:
@@ -186,6 +193,12 @@ def _check(args: argparse.Namespace) -> None:
     for name in rectify_image.OPTIONS:
         if name not in _OF_BOTH and rectify_image.is_given(args, name):
             raise UserError(f"--{name.replace('_', '-')}: goes with an image and its --sensor, not with a recording")
+
+
+def _extent(grid: GroundGrid, low: NDArray[np.floating], high: NDArray[np.floating]) -> str:
+    """Corners (column, row) as bounds in the CRS."""
+    (left, right), (top, bottom) = grid.centre(*np.transpose([low, high]))
+    return rectify_image.words_of_bounds([left, bottom, right, top]) + f" in {grid.frame.crs}"
 
 
 def _tell(result: dict[str, Any], done: Rectified, args: argparse.Namespace, unit: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,8 @@ _CONTROL = (
 )  # fmt: skip
 #: An orthoimage with more cells a side is refused: GDAL counts rows and columns in 31 bits.
 MOST_SIDE = 2_000_000_000
+#: No coordinate of a CRS is as large.
+MOST_COORDINATE = 1e12
 #: Options (as attributes) that a recording does not take.
 OPTIONS = (
     "model", "first_pixel", "refraction", "control", "correction", "dem_crs", "dem_datum", "bounds", "nodata", "direct",
@@ -60,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options that go with an image."""
     group = parser.add_argument_group(
         "an image of a sensor (with --sensor)",
-        "--refraction, --occlusions, --sigma, --pixel-sigma, --height-sigma and --dem-crs go with a recording, too",
+        "of a recording, too: --bounds, --refraction, --occlusions, --sigma, --pixel-sigma, --height-sigma, --dem-crs",
     )
     group.add_argument(
         "--sensor", metavar="META", action="append",
@@ -215,10 +218,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UserError(f"--correction {args.correction}: goes with --control CSV, whose points it is found by")
     if args.direct and (args.sigma or args.occlusions):
         raise UserError("--direct: sees nothing hidden and makes no sigmas, wanted without --occlusions and --sigma")
-    if args.bounds is not None:
-        left, bottom, right, top = args.bounds
-        if not (left < right and bottom < top):
-            raise UserError(f"--bounds {args.bounds}: wanted left below right and bottom below top")
+    refuse_empty_bounds(args)
     for name in ("position_sigma", "attitude_sigma", "pixel_sigma", "height_sigma"):
         value = getattr(args, name)
         if value is not None and not (np.isfinite(value).all() and (np.asarray(value) >= 0).all()):
@@ -233,6 +233,21 @@ def _check(args: argparse.Namespace) -> None:
         raise UserError("--plain and --compress: wanted one of them")
     if args.workers is not None and args.workers < 1:
         raise UserError(f"--workers {args.workers}: wanted at least 1")
+
+
+def refuse_empty_bounds(args: argparse.Namespace) -> None:
+    """Refuse --bounds between which there is nothing."""
+    if args.bounds is not None:
+        left, bottom, right, top = args.bounds
+        if not (np.abs(args.bounds).max() < MOST_COORDINATE and left < right and bottom < top):
+            raise UserError(
+                f"{words_of_bounds(args.bounds)}: wanted coordinates, left below right and bottom below top"
+            )
+
+
+def words_of_bounds(bounds: Sequence[float]) -> str:
+    """Bounds as they are given on the command line."""
+    return "--bounds " + " ".join(f"{value:.10g}" for value in bounds)
 
 
 def refuse_occlusions_of_level_ground(args: argparse.Namespace) -> None:

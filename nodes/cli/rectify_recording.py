@@ -14,7 +14,7 @@ from ...solver.geometry.ellipsoid import WGS84
 from ...solver.geometry.frames import LocalFrame
 from ...solver.matching.round_earth import tilt
 from ...solver.orthoimage.error_band import GroundErrors
-from ...solver.orthoimage.ground_grid import GroundGrid, metres_a_unit, utm_of
+from ...solver.orthoimage.ground_grid import CellWindow, GroundGrid, metres_a_unit, utm_of
 from ...solver.orthoimage.orientation import LineOrientation
 from ...solver.orthoimage.surface import Ellipsoid, HeightField, Surface, UnderAir
 from ...solver.rectification.relief_shadows import ReliefShadows
@@ -133,17 +133,18 @@ def prepared(args: argparse.Namespace, path: Path) -> Prepared:
     )  # fmt: skip
 
 
-def cells_of(args: argparse.Namespace, of: Prepared) -> tuple[GroundGrid, int]:
-    """The cells, and how many pixels are put together each way.
+def cells_of(args: argparse.Namespace, of: Prepared) -> tuple[GroundGrid, int, CellWindow | None]:
+    """The cells, how many pixels are put together each way, and the part that is wanted, None for all.
 
     Raises
     ------
     UserError : too many cells
     """
     grid = GroundGrid(of.target, args.gsd or float(f"{of.pixel_m / metres_a_unit(of.target):.2g}"))
+    part = None if args.bounds is None else grid.window(*args.bounds)
     if not args.mosaic:  # a mosaic is not held in memory
-        _check_size(of.recording, of.camera, of.ccd, of.pixel_m, grid)
-    return grid, pixels_together(grid, of.pixel_m)
+        _check_size(of.recording, of.camera, of.ccd, of.pixel_m, grid, part)
+    return grid, pixels_together(grid, of.pixel_m), part
 
 
 def pixels_together(grid: GroundGrid, pixel_m: float) -> int:
@@ -243,10 +244,15 @@ def _errors(
     return GroundErrors((args.pixel_sigma or 0.0) * pitch_mm, args.height_sigma or 0.0)
 
 
-def _check_size(recording: Recording, camera: LineCamera, ccd: int, pixel: float, grid: GroundGrid) -> None:
-    lines = max((int(message.body.lines) for message in recording.messages("configuration/strip")), default=0)
-    cells = lines * camera.lines[ccd].pixels * (pixel / grid.cell_m) ** 2
+def _check_size(
+    recording: Recording, camera: LineCamera, ccd: int, pixel: float, grid: GroundGrid, part: CellWindow | None
+) -> None:
+    if part is None:
+        lines = max((int(message.body.lines) for message in recording.messages("configuration/strip")), default=0)
+        cells, more = lines * camera.lines[ccd].pixels * (pixel / grid.cell_m) ** 2, ", or --bounds of a part"
+    else:
+        cells, more = part.shape[0] * part.shape[1], ", or a smaller part"
     if cells > MOST_CELLS:
         raise UserError(
-            f"--gsd {grid.gsd:g}: some {cells:.1g} cells, wanted at most {MOST_CELLS:.0e}: choose a larger one"
+            f"--gsd {grid.gsd:g}: some {cells:.1g} cells, wanted at most {MOST_CELLS:.0e}: choose a larger one{more}"
         )

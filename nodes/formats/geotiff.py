@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...solver.orthoimage.ground_grid import GroundGrid
+from ...solver.orthoimage.ground_grid import CellWindow, GroundGrid
 from ...solver.orthoimage.mosaic import Mosaic
 from ..errors import UserError
 from .keys import is_there
@@ -439,13 +439,15 @@ def _ends_of_blocks(source: Any) -> Iterator[int]:
 
 
 def write_orthoimage(
-    path: Path, mosaic: Mosaic, grid: GroundGrid, tags: dict[str, str], sigma: Path | None = None
-) -> tuple[int, int]:
+    path: Path, mosaic: Mosaic, grid: GroundGrid, tags: dict[str, str], sigma: Path | None = None,
+    part: CellWindow | None = None,
+) -> tuple[int, int]:  # fmt: skip
     """A mosaic as cloud-optimised GeoTIFF with overviews; 0 is no data. Returns rows and columns.
 
     Parameters
     ----------
     sigma : file for its sigmas in the plane and of the height, if it has them
+    part : the cells of the file; None for all up to the outermost that have something in them
 
     Raises
     ------
@@ -454,11 +456,11 @@ def write_orthoimage(
     from rasterio.errors import NotGeoreferencedWarning
 
     try:
-        row0, row1, column0, column1 = mosaic.extent()
+        part = CellWindow(*mosaic.extent()) if part is None else part
     except ValueError as error:
         raise UserError(f"{path}: {error}") from None
-    x, y = grid.corner(column0, row0)
-    shape = row1 - row0, column1 - column0
+    x, y = grid.corner(part.column0, part.row0)
+    shape = part.shape
     crs = None if grid.frame.crs == "local" else grid.frame.crs
     raster = Raster(crs, x, y, grid.gsd, *shape, 1, mosaic.dtype.name, 0, tags)
     with warnings.catch_warnings(), ExitStack() as stack:
@@ -471,7 +473,7 @@ def write_orthoimage(
         for r in range(0, shape[0], BLOCK):
             for c in range(0, shape[1], BLOCK):
                 end = min(r + BLOCK, shape[0]), min(c + BLOCK, shape[1])
-                window = row0 + r, row0 + end[0], column0 + c, column0 + end[1]
+                window = part.row0 + r, part.row0 + end[0], part.column0 + c, part.column0 + end[1]
                 cells = mosaic.read(*window)
                 if cells.any():
                     target.write(r, c, cells[None])

@@ -23,6 +23,27 @@ AT_ONCE = 20_000
 
 
 @dataclass(frozen=True)
+class CellWindow:
+    """Cells of a `GroundGrid` from the first row and column up to, and without, the last."""
+
+    row0: int
+    row1: int
+    column0: int
+    column1: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.row1 - self.row0, self.column1 - self.column0
+
+    def meets(self, low: Array, high: Array) -> bool:
+        """Whether some of it lies between two corners (column, row)."""
+        return bool(
+            low[0] < self.column1 and high[0] > self.column0 - 1 and low[1] < self.row1 and high[1] > self.row0 - 1
+        )
+
+
+@dataclass(frozen=True)
 class GroundGrid:
     """Square cells, numbered over the whole projection, so that mosaics of one cell size fit.
 
@@ -59,6 +80,13 @@ class GroundGrid:
     def corner(self, column: int, row: int) -> tuple[float, float]:
         """CRS coordinates of a cell's upper left corner."""
         return column * self.gsd, -row * self.gsd
+
+    def window(self, left: float, bottom: float, right: float, top: float) -> CellWindow:
+        """The cells that have a part between these CRS coordinates."""
+        # what a bound is off by rounding is no reason for one more cell
+        rows = int(np.floor(-top / self.gsd + 1e-6)), int(np.ceil(-bottom / self.gsd - 1e-6))
+        columns = int(np.floor(left / self.gsd + 1e-6)), int(np.ceil(right / self.gsd - 1e-6))
+        return CellWindow(*rows, *columns)
 
     def centre(self, column: Array, row: Array) -> tuple[Array, Array]:
         """CRS coordinates of places given in cells."""

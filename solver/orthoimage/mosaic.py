@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .ground_grid import CellWindow
 from .strip import Patch
 
 TILE = 512
@@ -74,6 +75,21 @@ class Mosaic:
         if key not in self._sigma:
             self._sigma[key] = np.full((2, self.tile, self.tile), np.nan, dtype=np.float32)
         return self._sigma[key]
+
+    def clip(self, part: CellWindow) -> None:
+        """Forget what lies beside a part."""
+        for i, j in list(self.tiles):
+            inside = np.zeros((self.tile, self.tile), dtype=bool)
+            inside[
+                max(part.row0 - i * self.tile, 0) : max(part.row1 - i * self.tile, 0),
+                max(part.column0 - j * self.tile, 0) : max(part.column1 - j * self.tile, 0),
+            ] = True
+            self.tiles[i, j][~inside] = self._steepness[i, j][~inside] = 0
+            if (i, j) in self._sigma:
+                self._sigma[i, j][:, ~inside] = np.nan
+            if not self.tiles[i, j].any():
+                del self.tiles[i, j], self._steepness[i, j]
+                self._sigma.pop((i, j), None)
 
     def extent(self) -> tuple[int, int, int, int]:
         """First and last-plus-one row, first and last-plus-one column of cells with something in them.

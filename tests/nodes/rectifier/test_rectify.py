@@ -121,6 +121,34 @@ def test_orthoimage_shows_the_ground_where_it_is(flown, simulated, dem, folder, 
     assert np.abs(peak).max() < 0.1, "best shift, cells"
 
 
+def test_a_part_is_the_same_window_of_the_whole(flown, folder, capsys):
+    whole, part = folder / "whole.tif", folder / "part.tif"
+    sigmas = folder / "whole_sigma.tif", folder / "part_sigma.tif"
+    options = "--gsd", "5", "--ccd", "N", "--sigma"
+    _rectify(capsys, flown, whole, *options, sigmas[0])
+    with rasterio.open(whole) as image:
+        left, bottom, right, top = image.bounds
+        middle = image.read(1)[40:80, 20:60]
+        corner = [left + 100.0, top - 400.0, left + 300.0, top - 200.0]
+    result = _rectify(capsys, flown, part, *options, sigmas[1], "--bounds", *corner)
+    with rasterio.open(part) as image:
+        assert image.bounds == tuple(corner) and image.shape == (40, 40)
+        cells = image.read(1).astype(float)
+        assert (cells > 0).all() and np.abs(cells - middle).mean() < 0.01 * middle.mean() and middle.std() > 20.0
+    with rasterio.open(sigmas[0]) as of_whole, rasterio.open(sigmas[1]) as of_part:
+        assert of_part.read() == pytest.approx(of_whole.read()[:, 40:80, 20:60], rel=0.01)
+    lines = result["strips"]["S1"]
+    of_strip = int(Recording(flown).last_strips()["S1"].lines)
+    assert lines + result["left_out"]["beside the bounds"] == of_strip // 2 * 2  # two pixels to a cell
+    assert lines < of_strip / 2
+    assert main(["rectify", str(flown), "-o", str(folder / "none.tif"), "--bounds", "8", "48", "9", "49"]) == 1
+    told = capsys.readouterr().err
+    assert "no line sees --bounds 8 48 9 49; all lines together see --bounds " in told and "in EPSG:32632" in told
+    seen = [float(word) for word in told.partition("see --bounds")[2].split()[:4]]
+    assert np.abs(np.array(seen) - [left, bottom, right, top]).max() < 100.0
+    assert not (folder / "none.tif").exists()
+
+
 def test_roads_become_straight(flown, simulated):
     """Off by more than 3 px with the measured orientation, by less than 0.3 px with the final one."""
     flight = simulated.simulation.flight
