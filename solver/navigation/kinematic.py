@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..geometry.frames import LocalFrame, opk_covariance_from_navigation
 from ..geometry.rotation import angles_from_matrix, matrix_from_navigation, quaternion_from_matrix
 from ..models.gauss_markov import second_order_gauss_markov
+from .kalman_filter import kalman_filter
 from .kinematic_model import N_STATES, WD, A, KinematicOptions, P, V, W, noise_time, quintic, transition
 from .pose import AttitudeHistory, NavigationEvent, NavigationPose, PoseMaker
 
@@ -89,9 +90,7 @@ class KinematicFilter:
     @cached_property
     def _kf(self) -> Any:
         """The filter; made with the first fix, since a navigator with inertial data makes none."""
-        from filterpy.kalman import KalmanFilter
-
-        kf = KalmanFilter(dim_x=N_STATES, dim_z=3)
+        kf = kalman_filter()(dim_x=N_STATES, dim_z=3)
         kf.x = np.zeros(N_STATES)
         return kf
 

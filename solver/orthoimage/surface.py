@@ -8,7 +8,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
 
 from ..geometry import earth
 from ..geometry.frames import LocalFrame
@@ -236,6 +235,8 @@ class HeightField:
     @cached_property
     def _squares(self) -> Array:
         """Highest ground (m) and its steepest slope (metres a metre) in and next to squares of cells, (2, k, m)."""
+        from scipy.ndimage import maximum_filter  # not where all ground is level: it takes a tenth of a second
+
         rows, columns = self.z_m.shape
         starts = np.arange(0, columns, SQUARE_CELLS)
         out = []

@@ -75,6 +75,23 @@ def test_a_look_into_a_recording_imports_hardly_anything():
     assert "cryptography" in imported("check", "none", packages=NOT_FOR_INFO)
 
 
+def test_processing_a_flight_imports_no_statistics_and_who_wants_them_has_them(tmp_path):
+    """filterpy imports `scipy.stats`, which took a third of the time before `process` works."""
+    code = (
+        "import sys\nfrom triline.nodes.cli import main\n"
+        f"assert main(['process', 'recordings/strip.mcap', '-o', {str(tmp_path / 'out.mcap')!r}, '-q']"
+        " + ['--nodes', 'navigator', '--processes', '1']) == 0\n"
+        "assert 'filterpy' in sys.modules and not {'scipy.stats', 'scipy.ndimage'} & set(sys.modules)\n"
+        "import filterpy.discrete_bayes, filterpy.stats\n"
+        "found = filterpy.stats.logpdf(1.0, 0.0, 4.0), *filterpy.discrete_bayes.predict([0.0, 1.0, 0.0], 1, [1.0])\n"
+        "import scipy.stats\n"
+        "print(found[0] - scipy.stats.norm(0.0, 2.0).logpdf(1.0), *found[1:], filterpy.stats.norm(1.0, 2.0).cdf(1.0))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    difference, *moved, half = map(float, run.stdout.splitlines()[-1].split())
+    assert abs(difference) < 1e-12 and half == 0.5 and moved == [0.0, 0.0, 1.0]
+
+
 def ended(tmp_path, number: int, module: str, *words: str) -> subprocess.CompletedProcess[str]:
     """A command to which a signal comes as it imports a module."""
     code = (
