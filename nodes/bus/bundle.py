@@ -77,6 +77,10 @@ class Bundle:
         )
 
     @property
+    def is_desk(self) -> bool:
+        return self.kind == DESK
+
+    @property
     def configuration(self) -> Path:
         """The Zenoh configuration."""
         return self.folder / CONFIGURATION

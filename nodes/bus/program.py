@@ -10,13 +10,15 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..config import Tables
 from ..registry import SENSORS
-from .bundle import Bundle, ExpiryWatch
 from .priority import go_first
 from .session import Bus
+
+if TYPE_CHECKING:
+    from .bundle import Bundle, ExpiryWatch
 
 #: What is late where another program takes the processor is lost, or comes too late for who flies: these nodes go
 #: before others. The matcher and whoever draws use what is left.
@@ -63,6 +65,8 @@ class ProgramOptions:
         if alone := bus.why_alone():
             self.report(alone)
         if self.secure is not None:
+            from .bundle import ExpiryWatch
+
             watch = ExpiryWatch(self.secure)
             self.tell_expiry(watch)
             threading.Thread(target=self._watch_expiry, args=(watch,), name="expiry", daemon=True).start()

@@ -19,7 +19,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import zenoh
 import zenoh.ext
@@ -28,9 +28,10 @@ from ...schemas import codec, topics
 from ...schemas.envelope import Envelope, RawMessage, pack, unpack
 from ..errors import UserError
 from ..node import Message
-from .authority import DESK
-from .bundle import Bundle, speaks_tls
 from .links import BEAT_S, LinkWatch
+
+if TYPE_CHECKING:  # certificates take a tenth of a second to import
+    from .bundle import Bundle
 
 DEFAULT_PORT = 17447
 #: Messages of a latched topic that a publisher keeps for whoever joins later.
@@ -497,7 +498,7 @@ class Bus:
     def why_alone(self, patience_s: float = 3.0) -> str:
         """Why this session meets nobody: a program that is none of ours holds the meeting port; "" if none does."""
         until = time.monotonic() + patience_s
-        if self._secure is not None and self._secure.kind == DESK:  # an aircraft's first node is alone for a while
+        if self._secure is not None and self._secure.is_desk:  # an aircraft's first node is alone for a while
             while not self.peers():
                 if time.monotonic() > until:
                     endpoints = json.loads(configuration(self._port, self._file).get_json("connect/endpoints"))
@@ -507,6 +508,8 @@ class Bus:
             return ""
         while self._held and not self.peers():
             if time.monotonic() > until:
+                from .bundle import speaks_tls
+
                 if speaks_tls("127.0.0.1", self._port or 0):
                     return f"nobody can be met: port {self._port} answers in TLS alone, wanted --secure BUNDLE"
                 return (

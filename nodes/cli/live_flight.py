@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ...schemas.topics import TOPICS, may_be_dropped
-from ..bus.bundle import ExpiryWatch, load_bundle
 from ..bus.folder_lock import locked
 from ..bus.processes import NodeGroup, NodeProcess
 from ..bus.program import end_by_signal
@@ -29,6 +28,7 @@ from ..monitor.monitor import ENDING, display
 from ..step_driver import failure_words
 
 if TYPE_CHECKING:
+    from ..bus.bundle import Bundle, ExpiryWatch
     from ..bus.session import Bus
     from ..monitor.monitor import Overview
     from ..monitor.sensor_watch import SensorWatch
@@ -62,10 +62,15 @@ class LiveFlight:
 
     def __init__(self, args: argparse.Namespace, platform: str, title: str, estimators: tuple[str, ...]) -> None:
         self.args, self.platform, self.title, self.estimators = args, platform, title, estimators
-        self.secure = load_bundle(args.secure) if args.secure is not None else None
-        self.expiry = ExpiryWatch(self.secure) if self.secure is not None else None
-        if self.secure is not None and self.secure.kind != "aircraft":
-            raise UserError(f"--secure {args.secure}: is of a desk, wanted the bundle of an aircraft")
+        self.secure: Bundle | None = None
+        self.expiry: ExpiryWatch | None = None
+        if args.secure is not None:
+            from ..bus.bundle import ExpiryWatch, load_bundle
+
+            self.secure = load_bundle(args.secure)
+            self.expiry = ExpiryWatch(self.secure)
+            if self.secure.kind != "aircraft":
+                raise UserError(f"--secure {args.secure}: is of a desk, wanted the bundle of an aircraft")
         self.folder: Path = args.output
         self.recording = self.folder / "flight.mcap"
         self.stop = threading.Event()

@@ -9,13 +9,11 @@ import threading
 import time
 from collections import deque
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...schemas import codec, topics
 from ...schemas import messages as m
 from ...schemas.envelope import Envelope, RawMessage
-from ..bus.authority import AUTHORITY, CERTIFICATE, KEY
-from ..bus.bundle import Bundle, load_bundle
 from ..bus.downlink import INVENTORY, asked
 from ..bus.program import ProgramOptions
 from ..bus.recall import Recall
@@ -25,8 +23,11 @@ from ..errors import UserError
 from ..node import STOPPING, Node
 from ..ordering import StreamCheck, order_key
 from ..recording.reread import Reread, Stream
-from ..recording.seal import Seal
 from ..recording.writer import COMPRESSIONS, RecordingWriter
+
+if TYPE_CHECKING:
+    from ..bus.bundle import Bundle
+    from ..recording.seal import Seal
 
 #: The open chunk is closed at least so often: what SIGKILL can cost.
 FLUSH_S = 0.3
@@ -110,6 +111,9 @@ class RecordingFile:
 
 
 def _seal(path: Path, bundle: Bundle) -> Seal:
+    from ..bus.authority import AUTHORITY, CERTIFICATE, KEY
+    from ..recording.seal import Seal
+
     return Seal(path, bundle.folder / CERTIFICATE, bundle.folder / AUTHORITY, bundle.folder / KEY)
 
 
@@ -136,7 +140,11 @@ class Recorder(Node):
             raise ValueError(f"compression is {compression!r}, wanted one of {', '.join(COMPRESSIONS)}")
         if rotate_mb < 0:
             raise ValueError(f"rotate_mb is {rotate_mb}, wanted 0 or more")
-        self._bundle = load_bundle(Path(sign)) if sign else None
+        self._bundle: Bundle | None = None
+        if sign:
+            from ..bus.bundle import load_bundle  # certificates take a tenth of a second to import
+
+            self._bundle = load_bundle(Path(sign))
         self._path = Path(output)
         self._compression = compression
         self._rotate_bytes = int(rotate_mb * 1e6)

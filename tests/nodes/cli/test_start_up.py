@@ -75,6 +75,16 @@ def test_a_look_into_a_recording_imports_hardly_anything():
     assert "cryptography" in imported("check", "none", packages=NOT_FOR_INFO)
 
 
+def test_nodes_on_an_open_bus_import_no_certificates():
+    code = (
+        "import sys\nimport triline.nodes.bus.live, triline.nodes.bus.program, triline.nodes.recorder.recorder\n"
+        "import triline.nodes.cli.demo\nassert 'zenoh' in sys.modules\n"
+        "print({'cryptography', 'ssl'} & set(sys.modules))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert run.stdout == "set()\n"
+
+
 def test_processing_a_flight_imports_no_statistics_and_who_wants_them_has_them(tmp_path):
     """filterpy imports `scipy.stats`, which took a third of the time before `process` works."""
     code = (
