@@ -76,7 +76,8 @@ class QualityControl:
             if self._sources.begin():
                 self._control.strip_began()
             self._sources.take_in(now_s)
-        if test:
+        # while new looks disagree by far more than sigmas say, these are asked first: no source is named as well
+        if test and (before or self._network.sigmas.disagreement == 1.0):
             # where control and GNSS are told to differ, that is why all tie points contradict one of them
             self._sources.test(now_s, of_all=not self._control.differs_from_gnss)
         return self._sources.biased != before

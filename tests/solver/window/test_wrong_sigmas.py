@@ -17,7 +17,7 @@ from triline.solver.models.wander import GLOBALS
 from triline.solver.simulation.error_models import ErrorModel
 from triline.solver.simulation.flight import FlightPlan
 from triline.solver.simulation.misspecified_study import OBSERVED, ROWS, SETTINGS
-from triline.solver.simulation.misstated import World
+from triline.solver.simulation.misstated import Sine, World
 from triline.solver.simulation.scenario import ObservationPlan, simulate
 from triline.solver.simulation.window_study import (
     adjust_online,
@@ -179,6 +179,15 @@ def test_vibration_is_not_taken_for_a_wander():
     assert 0.6 < points.nees.mean() < 1.6
     assert 0.5 < orientation_errors(simulation, online.whole).nees.mean() < 2.0
     assert max(r.quality.trajectory[2] for r in online.reports[len(online.reports) // 2 :]) < 3.0
+
+
+def test_no_source_is_named_while_sigmas_are_questioned():
+    """A vibration of 13 pixels was named as tie points that drift while its noise was being found."""
+    world = World(sines=(Sine((0.03, 0.03, 0.03), 3.0),))
+    simulation = simulate(replace(PLAN, strip_s=15.0), 5, SETTINGS["rtk"], OBSERVED, world=world)
+    online = adjust_online(simulation, navigate(simulation), OPTIONS, live=False, update_s=0.5)
+    assert any("which are being questioned" in r.quality.reason for r in online.reports)
+    assert not any(r.quality.sources for r in online.reports)
 
 
 @pytest.mark.study
