@@ -25,6 +25,9 @@ SAME_M, SAME_RAD = 1e-3, 1e-6
 #: Places in a local frame and latitudes and longitudes beside them are the same within their decimals, m, and the frame
 #: is found in so many rounds at most.
 BESIDE_M, MOST_ROUNDS = 0.01, 10
+#: Places in a CRS that are farther from latitudes and longitudes beside them, m, are in another one: datums differ by
+#: less. Heights that are farther from those beside them, m, may count from something else. Tuned.
+ELSEWHERE_M, OTHER_HEIGHT_M = 500.0, 1.0
 #: Quantity -> how files call it, without unit.
 _NAMES = {
     "lat": ("lat", "latitude"),
@@ -71,7 +74,8 @@ def read_trajectory_csv(path: Path, crs: str | None = None, day: date | None = N
     in the CRS given, where its units may stand in the names (``X_deg``), with optional sigmas along its axes as tables
     of refined orientation have them (``sigma_X_m`` .. ``sigma_kappa_deg``, empty where they are not known). Those of a
     local frame need no CRS where ``lat_deg,lon_deg,height_m`` beside them tell where it lies, as in the table of
-    `write_oriented_lines`; roll, pitch and heading there are of the body, and are not read.
+    `write_oriented_lines`; roll, pitch and heading there are of the body, and are not read. With a CRS these tell
+    whether it is the right one.
 
     Parameters
     ----------
@@ -93,8 +97,8 @@ def _track_table(path: Path, crs: str | None, notes: list[str], *more: Column) -
     photogrammetric = _is_photogrammetric(header)
     names = {} if photogrammetric else _columns(path, header)
     wanted = _PHOTOGRAMMETRIC if photogrammetric else tuple(Column(name) for name in names.values())
-    placed = photogrammetric and crs in (None, "local") and set(_GEODETIC) <= set(header)
-    columns = [*time, *wanted, *(Column(name) for name in _GEODETIC if placed)]
+    local = crs in (None, "local")
+    columns = [*time, *wanted, *_beside(header, blank=not local)] if photogrammetric else [*time, *wanted]
     sigmas = _sigmas_of(header)
     columns += [Column(name, low=0.0, blank=photogrammetric) for name in sigmas if name in header]
     table = read_table(path, [*columns, *more], notes)
@@ -132,16 +136,19 @@ def _track(table: Table, crs: str | None, day: date | None, notes: list[str]) ->
 
 def _local_table(path: Path, *more: Column) -> Table:
     """The columns that `_local_poses` needs, with more of them where the file has them."""
-    time = _header(path)[1]
-    return read_table(path, [*time, *(Column(column.name) for column in _PHOTOGRAMMETRIC), *more], [])
+    header, time = _header(path)
+    beside = _beside(header, blank=False)
+    return read_table(path, [*time, *(Column(column.name) for column in _PHOTOGRAMMETRIC), *beside, *more], [])
 
 
-def _local_poses(table: Table) -> Poses:
+def _local_poses(table: Table, frame: LocalFrame) -> Poses:
     """The poses of a table, which `_local_table` has read, or of some of its rows.
+
+    They are in the local frame given, or in the one that latitudes, longitudes and heights beside them tell.
 
     Raises
     ------
-    UserError : two poses at one time, fewer than two times
+    UserError : two poses at one time, fewer than two times, places in no local frame by latitudes beside them
     """
     path, time, notes = table.path, time_columns(table.values), list[str]()
     time_ns, first, of = np.unique(times_of(table, time, None, notes), return_index=True, return_inverse=True)
@@ -156,7 +163,15 @@ def _local_poses(table: Table) -> Poses:
         time[0].name,
         lambda i: f"{shown(i)} comes twice with two poses, wanted those of one lens or strip a time",
     )
-    return position[first], R[first], time_ns
+    position, R = position[first], R[first]
+    if frame.is_placed and all(name in table for name in _GEODETIC):
+        beside = table.stack(*_GEODETIC)
+        if not np.abs(frame.from_geodetic(*beside.T) - table.stack(*PLACE)).max() < BESIDE_M:
+            other_frame = _frame_of(path, table, table.stack(*PLACE))
+            rpy = navigation_from_R_lc(other_frame, position, R)
+            position = frame.from_geodetic(*other_frame.to_geodetic(position).T)
+            R = R_lc_from_navigation(frame, position, rpy)
+    return position, R, time_ns
 
 
 @dataclass(frozen=True)
@@ -196,7 +211,8 @@ def read_poses_of_strips(path: Path, frame: LocalFrame) -> PosesOfStrips:
     `triline adjust` and of `write_oriented_lines`.
 
     Of a table as `read_trajectory_csv` reads it; of a project without a CRS
-    ``time_s,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg`` in its local frame, in any order, where a pose may come twice.
+    ``time_s,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg`` in its local frame, or in another one where
+    ``lat_deg,lon_deg,height_m`` beside them say so, in any order, where a pose may come twice.
 
     Raises
     ------
@@ -209,8 +225,11 @@ def read_poses_of_strips(path: Path, frame: LocalFrame) -> PosesOfStrips:
         position = frame.from_geodetic(*track.geodetic.T)
         return position, R_lc_from_navigation(frame, position, track.rpy), track.time_ns
 
+    def in_local_frame(table: Table) -> Poses:
+        return _local_poses(table, frame)
+
     if frame.crs == "local":
-        table, poses = _local_table(path, *more), _local_poses
+        table, poses = _local_table(path, *more), in_local_frame
     else:
         refuse_missing_grids(frame.crs, path)
         table, poses = _track_table(path, frame.crs, [], *more), in_frame
@@ -302,6 +321,7 @@ def _from_crs(
             R_l_crs = frame.R_l_crs(xyz)
         except CrsError as error:
             raise UserError(f"{path}: {error}") from None
+        _compare_beside(path, table, frame, position, crs, notes)
     geodetic, rpy = (
         frame.to_geodetic(position),
         navigation_from_R_lc(frame, position, R_l_crs @ matrix_from_angles(*angles.T)),
@@ -320,6 +340,36 @@ def _from_crs(
     T[:, :3, :3], T[:, 3:, 3:] = R_n_crs, R_n_crs @ np.linalg.inv(angles_jacobian(angles))
     sigma[:, 3:] = np.radians(sigma[:, 3:])
     return geodetic, rpy, T @ (np.square(sigma)[:, :, None] * np.swapaxes(T, 1, 2))
+
+
+def _beside(header: Collection[str], *, blank: bool) -> list[Column]:
+    """Latitude, longitude and height beside coordinates, where a table has all three."""
+    return [Column(name, blank=blank) for name in _GEODETIC] if set(_GEODETIC) <= set(header) else []
+
+
+def _compare_beside(
+    path: Path, table: Table, frame: LocalFrame, position: np.ndarray, crs: str, notes: list[str]
+) -> None:
+    """Refuse a CRS in which places (n, 3) are not where latitudes and longitudes in the same rows say; note heights.
+
+    Raises
+    ------
+    UserError : how far off they are
+    """
+    if not all(name in table for name in _GEODETIC):
+        return
+    beside = table.stack(*_GEODETIC)
+    known = ~np.isnan(beside).any(axis=1)
+    if not known.any():
+        return
+    off = np.median(position[known] - frame.from_geodetic(*beside[known].T), axis=0)
+    if not (far := float(np.hypot(*off[:2]))) < ELSEWHERE_M:
+        beside_them = f"{far / 1e3:.1f} km from lat_deg, lon_deg beside them"
+        raise UserError(f"{path}: X_m, Y_m in {crs!r} are {beside_them}, wanted the CRS that they are in")
+    if abs(off[2]) > OTHER_HEIGHT_M:
+        beside_them = f"{abs(off[2]):.1f} m {'above' if off[2] > 0 else 'below'} height_m beside them"
+        what = "do they count from a geoid (EPSG:32632+EPSG:5773)?"
+        notes.append(f"{path.name}: heights Z_m in {crs!r} are {beside_them}: {what}")
 
 
 def _frame_of(path: Path, table: Table, xyz: np.ndarray) -> LocalFrame:

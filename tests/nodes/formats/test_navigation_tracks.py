@@ -21,7 +21,7 @@ from triline.nodes.formats.line_orientation import OrientedLines, write_oriented
 from triline.nodes.formats.pos_export import mapping_frame, read_pos_export
 from triline.nodes.formats.sbet import read_sbet, write_sbet
 from triline.nodes.formats.track import Accuracy, Mounting, NavigationTrack, camera_poses, frame_of, track_messages
-from triline.nodes.formats.trajectory_csv import read_trajectory_csv
+from triline.nodes.formats.trajectory_csv import read_poses_of_strips, read_trajectory_csv
 from triline.nodes.recording.reader import RecordingReader
 from triline.solver.geometry.frames import LocalFrame, R_lc_from_navigation, navigation_from_R_lc
 from triline.solver.geometry.rotation import (
@@ -521,6 +521,47 @@ def test_lines_in_a_local_frame_come_back_as_they_were(lat, lon, tmp_path):
     path.write_text(text.replace("X_m,Y_m", "X_deg,Y_deg"))  # of scenes in a geographic CRS
     with pytest.raises(UserError, match="1: X_deg: coordinates of no local frame, wanted the --crs that they are in"):
         read_trajectory_csv(path)
+
+
+def written_lines(path, frame, lat=48.2, lon=11.2):
+    """Forty lines of a strip as `triline export --per-line` writes them, and their places and attitudes."""
+    rng = np.random.default_rng(2)
+    position = frame.from_geodetic(lat + np.linspace(0.0, 0.02, 40), np.full(40, lon), rng.normal(2e3, 9.0, 40))
+    R = matrix_from_angles(*rng.normal([0.02, -0.05, 1.5], [0.01, 0.01, 2.0], (40, 3)).T)
+    stamps = ns("2026-05-01T10:00:00") + np.arange(40) * 5_000_000
+    part = OrientedLines("S1", np.arange(40), stamps, position, R, np.full((40, 6, 6), np.nan))
+    write_oriented_lines(path, [part], frame)
+    return position, R
+
+
+def test_lines_of_another_local_frame_are_taken_to_that_of_the_project(tmp_path):
+    """The same files imported twice may have another origin: lines of the one stood as far off in the other."""
+    path, here, there = tmp_path / "lines.csv", LocalFrame(48.2, 11.2, -60.0), LocalFrame(48.25, 11.1, 0.0)
+    position, R = written_lines(path, here)
+    at, R_lc, _ = read_poses_of_strips(path, there).of("S1")
+    np.testing.assert_allclose(at, there.from_geodetic(*here.to_geodetic(position).T), atol=2e-4)
+    np.testing.assert_allclose(
+        navigation_from_R_lc(there, at, R_lc), navigation_from_R_lc(here, position, R), atol=3e-9
+    )
+    same, R_same, _ = read_poses_of_strips(path, here).of(None)
+    np.testing.assert_allclose(same, position, atol=1e-4)
+    np.testing.assert_allclose(R_same, R, atol=3e-9)
+
+
+def test_crs_of_lines_is_held_against_latitudes_beside_them(tmp_path):
+    path = tmp_path / "lines.csv"
+    written_lines(path, LocalFrame(48.2, 11.2, 0.0, "EPSG:32632"))
+    assert not any("height_m" in note for note in read_trajectory_csv(path, "EPSG:32632").notes)
+    with pytest.raises(
+        UserError, match=r"'EPSG:32633' are 4\d+\.\d km from lat_deg, lon_deg beside them, wanted the CRS"
+    ):
+        read_trajectory_csv(path, "EPSG:32633")
+    lines = [line.split(",") for line in path.read_text().splitlines()]
+    height = lines[0].index("height_m")
+    raised = [lines[0], *([*row[:height], str(float(row[height]) + 47.0), *row[height + 1 :]] for row in lines[1:])]
+    path.write_text("\n".join(map(",".join, raised)))
+    notes = read_trajectory_csv(path, "EPSG:32632").notes
+    assert any("Z_m in 'EPSG:32632' are 47.0 m below height_m beside them" in note for note in notes)
 
 
 def test_trajectory_csv_damaged(tmp_path):
