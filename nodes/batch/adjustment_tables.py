@@ -25,6 +25,7 @@ Columns = dict[str, NDArray[Any]]
 
 _AXES = ("X", "Y", "Z")
 _ANGLES = ("omega", "phi", "kappa")
+_GEODETIC = ("lat_deg", "lon_deg", "height_m")
 
 
 def write_tables(adjustment: Adjustment, folder: Path) -> list[Path]:
@@ -95,12 +96,17 @@ def residuals_table(adjustment: Adjustment) -> Columns:
 
 
 def trajectory_table(adjustment: Adjustment) -> Columns:
-    """Refined orientation at the samples of the measured trajectories, in the project's CRS, with sigmas."""
+    """Refined orientation at the samples of the measured trajectories, in the project's CRS, with sigmas.
+
+    Where the place of the local frame is known, latitude, longitude and height above the ellipsoid say it: recordings
+    that are adjusted together stand in that of the first.
+    """
     frame, reference = adjustment.block.frame, adjustment.block.time_reference_ns
     parts = []
     for item in adjustment.result.solution.layout.sets:
         time = adjustment.block.strips[item.strip].trajectory.time_s
-        places, angles, sigma = poses_in_crs(*_refined(adjustment, item, time), frame)
+        position, R_lc, covariance = _refined(adjustment, item, time)
+        places, angles, sigma = poses_in_crs(position, R_lc, covariance, frame)
         angles = np.degrees(angles)
         decimals = 9 if frame.is_geographic else 5
         strip = _words([set_name(adjustment, item)] * len(time))
@@ -111,6 +117,9 @@ def trajectory_table(adjustment: Adjustment) -> Columns:
         columns |= {f"{a}_deg": np.round(angles[:, k], 9) for k, a in enumerate(_ANGLES)}
         columns |= {f"sigma_{a}_m": np.round(sigma[:, k], 6) for k, a in enumerate(_AXES)}
         columns |= {f"sigma_{a}_deg": np.round(np.degrees(sigma[:, 3 + k]), 9) for k, a in enumerate(_ANGLES)}
+        if frame.is_placed:
+            geodetic = frame.to_geodetic(position)
+            columns |= {a: np.round(geodetic[:, k], 5 if k == 2 else 10) for k, a in enumerate(_GEODETIC)}
         parts.append(columns)
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 

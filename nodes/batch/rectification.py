@@ -328,7 +328,8 @@ class OfTable:
     """Orientation of strips by a table that `triline adjust` or `triline export --per-line` wrote.
 
     Where it says in a column ``strip`` which one its rows are of, each strip has those of its own, or those of its
-    lens, where lenses were adjusted separately; else all rows count by their times alone.
+    lens, where lenses were adjusted separately, or those that have the name of its recording as well, where several
+    with strips of one name were; else all rows count by their times alone.
 
     Parameters
     ----------
@@ -353,7 +354,8 @@ class OfTable:
         if not poses.rows:
             found[None] = poses.of(None)
         for strip in (wanted or list(recording.last_strips())) if poses.rows else ():
-            name = next((n for n in (strip, f"{strip}/{lens}") if n in poses.rows), None)
+            joined = (strip, *(f"{strip}@{name}" for name in (recording.reader.path.stem, recording.reader.path)))
+            name = next((n for base in joined for n in (base, f"{base}/{lens}") if n in poses.rows), None)
             if name is not None or wanted:
                 found[strip] = poses.of(name or strip)
         if not found:

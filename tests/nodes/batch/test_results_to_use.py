@@ -12,6 +12,7 @@ import pytest
 import rasterio
 from test_adjust_command import AXES, write_block
 
+from triline.nodes.batch.rectification import OfTable, project_frame
 from triline.nodes.cli import main
 from triline.nodes.formats.camera_json import read_camera, write_camera
 from triline.nodes.formats.geotiff import Heights, write_heights
@@ -186,6 +187,34 @@ def test_sigmas_of_refined_orientation_hold_the_noise_of_the_poses(tmp_path):
         off -= np.hstack([at.position_l, np.degrees(at.angles)])
         squares = np.mean(np.square(off / sigma), axis=0)
         assert 0.5 < squares[5] < 2.4  # was 4.8
+
+
+def test_orientation_of_recordings_adjusted_together_goes_back_to_each(tmp_path):
+    """It stands in the local frame of the first one, under names of strips that no recording has."""
+    few = ["--seconds", "8", "--ties", "3", "--control", "0", "--check", "0", "--attitude-rate", "50", "-q"]
+    for name, heading in (("day1", "90"), ("drawn", "0")):
+        assert main(["simulate", "-o", str(tmp_path / f"{name}.mcap"), "--heading", heading, *few]) == 0
+    with RecordingWriter(tmp_path / "day2.mcap") as writer:  # with an origin of its own
+        for message in Recording(tmp_path / "drawn.mcap").messages():
+            if message.topic == "configuration/project":
+                body = m.Project()
+                body.CopyFrom(message.body)
+                body.origin_latitude += 0.1
+                message = replace(message, body=body)
+            writer.write(message)
+    days = [str(tmp_path / f"day{k}.mcap") for k in (1, 2)]
+    assert main(["adjust", *days, "-o", str(tmp_path / "out"), "--per-line", "-q"]) == 0
+    for table in ("trajectory_refined.csv", "orientation_lines.csv"):
+        assert set(pd.read_csv(tmp_path / "out" / table).strip) == {"S1@day1", "S1@day2"}
+        for day, drawn in zip(days, ("day1.mcap", "drawn.mcap"), strict=True):
+            of, frame = OfTable(Recording(day), tmp_path / "out" / table), project_frame(Recording(day))
+            true, in_frame = Recording(day).poses("truth/trajectory"), project_frame(Recording(tmp_path / drawn))
+            time_s = (true.time_ns - of.reference_ns) * 1e-9
+            inside = of.orientation.covers(time_s)
+            position, _ = of.orientation.at(time_s[inside])
+            wanted = frame.from_geodetic(*in_frame.to_geodetic(true.position_l[inside]).T)
+            assert inside.sum() > 10 and not of.missing
+            assert np.abs(position - wanted).max() < 9.0  # it was 11 km
 
 
 def test_lines_have_the_last_whole_orientation(oriented, tmp_path):
