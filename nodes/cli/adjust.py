@@ -126,7 +126,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--camera", type=Path, metavar="FILE",
-        help="camera.json in place of that of the input: one that an adjustment with --selfcal wrote",
+        help="camera.json in place of that of each input: one that an adjustment with --selfcal wrote",
     )  # fmt: skip
     group.add_argument("--free", action="store_true", help="additional parameters without a-priori weight")
     group.add_argument(
@@ -251,12 +251,15 @@ def _options_of_camera_and_clock(args: argparse.Namespace, inputs: int) -> None:
 def _run_block(args: argparse.Namespace, paths: Sequence[Path], dem: Mapping[str, Any]) -> Content:
     """Adjust flights and write the result; its content."""
     recordings = [read_input(path) for path in paths]
+    of_camera: list[str] = []
+    if args.camera is not None:  # before they are joined, since each may have another one
+        of_camera = [f"camera of {args.camera}"]
+        for i, own in enumerate(recordings):
+            camera = read_camera_instead(args.camera, own.camera, notes=None if i else of_camera)
+            recordings[i] = replace(own, camera=camera)
     joined = join_inputs(recordings, paths) if len(paths) > 1 else None
     block = recordings[0] if joined is None else joined.block
-    if args.camera is not None:
-        of_camera = [f"camera of {args.camera}"]
-        camera = read_camera_instead(args.camera, block.camera, notes=of_camera)
-        block = replace(block, camera=camera, notes=(*block.notes, *of_camera))
+    block = replace(block, notes=(*block.notes, *of_camera))
     surface = None
     if dem:
         raster, crs = Path(dem["dem"]), dem.get("dem_crs")

@@ -211,6 +211,22 @@ def test_result_files_have_what_the_interface_says(folder, tmp_path):
     assert list(refined.columns[:8]) == list(measured.columns) and len(refined) == len(measured)
 
 
+def test_a_camera_stands_in_place_of_that_of_each_input(folder, tmp_path, capsys):
+    """Two flights, one of which was processed with a calibrated camera: the camera that was given did not help."""
+    other = tmp_path / "other"
+    shutil.copytree(folder, other)
+    points = pd.read_csv(other / "image_points.csv")
+    points["line"] += 0.01  # the same image points would count twice
+    points.to_csv(other / "image_points.csv", index=False)
+    camera = json.loads((other / "camera.json").read_text())
+    camera["lenses"][0]["focal_length_mm"] += 0.01
+    (other / "camera.json").write_text(json.dumps(camera))
+    code, _, error = adjust(folder, other, "-q", capsys=capsys)
+    assert code == 1 and "other has another camera than block" in error
+    code, told, _ = adjust(folder, other, "--camera", folder / "camera.json", "-q", capsys=capsys)
+    assert code == 0 and told.count(f"note: camera of {folder / 'camera.json'}") == 1
+
+
 def test_refined_trajectory_is_measured_plus_correction(folder, tmp_path):
     assert adjust(folder, "-q", "-o", tmp_path) == 0
     result = result_in(tmp_path)
