@@ -145,9 +145,10 @@ class Table:
 
 
 def one_line(problems: Sequence[str], others: int = 0) -> str:
-    """The first problem, and how many more there are."""
+    """The first problem, and how many more there are: at least so many, where the search for them ended before."""
     more = others + len(problems) - 1
-    return problems[0] + (f" (and {more} more like it)" if more > 0 else "")
+    least = "at least " if len(problems) >= MOST_PROBLEMS else ""
+    return problems[0] + (f" (and {least}{more} more like it)" if more > 0 else "")
 
 
 def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_be_empty: bool = False) -> Table:

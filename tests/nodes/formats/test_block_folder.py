@@ -202,6 +202,8 @@ def test_zeros_say_that_nothing_wanders(tmp_path):
 def test_the_number_of_problems_is_told(tmp_path):
     with pytest.raises(UserError, match=r"image_points.csv:2: line: 'x' is not a number \(and 2 more like it\)"):
         read_block(write_files(tmp_path, image_points="point,strip,ccd,line,sample\n" + "G1,S1,F,x,1\n" * 3))
+    with pytest.raises(UserError, match=r"\(and at least 9 more like it\)"):  # of 39
+        read_block(write_files(tmp_path, image_points="point,strip,ccd,line,sample\n" + "G1,S1,F,x,1\n" * 40))
 
 
 def test_rays_of_unknown_strip_or_ccd_are_kept_and_named(tmp_path):
