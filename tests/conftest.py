@@ -2,7 +2,10 @@
 
 import gc
 import os
+import random
 import sys
+
+import pytest
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -26,11 +29,22 @@ WAITING = ("tests/test_demo.py", "tests/nodes/sensors/test_fly.py", "tests/test_
            "tests/nodes/jobs/")  # fmt: skip
 
 
+@pytest.hookimpl(hookwrapper=True)
+def pytest_make_collect_report(collector):
+    """Each worker of pytest-xdist imports the tests in another order: where they are not compiled yet, each file is by
+    one worker, and not by all of them at the same time."""
+    report = (yield).get_result()
+    worker = os.environ.get("PYTEST_XDIST_WORKER")
+    if worker and isinstance(collector, pytest.Session | pytest.Directory):
+        random.Random(worker).shuffle(report.result)
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
     def place(item):
         return next((i for i, path in enumerate(WAITING) if item.nodeid.startswith(path)), len(WAITING))
 
-    items.sort(key=place)
+    items.sort(key=lambda item: (place(item), item.path.parts))
 
 
 def pytest_collection_finish():
