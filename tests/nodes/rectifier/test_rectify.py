@@ -44,7 +44,7 @@ from triline.solver.simulation.road_check import find_roads
 
 #: A rough flight: roads are off by several pixels with the measured orientation.
 SETTINGS = {
-    "sensor": "ads40-small", "pixels": 800, "images": True, "seconds": 14.0, "ties": 12.0, "turbulence": 3.0,
+    "sensor": "ads40-small", "pixels": 800, "images": True, "seconds": 11.0, "ties": 12.0, "turbulence": 3.0,
     "lead_in": 3.0,
     "wander_attitude": (0.3,) * 3, "wander": (3.0,) * 3, "attitude_rate": 50.0,
     "control": 6, "check": 4, "cars": 0.0, "seed": 4,
@@ -168,7 +168,7 @@ def test_roads_become_straight(flown, simulated):
         done = job.finish()
         assert done is not None and done.missed_rays == 0
         roads = find_roads(done.mosaic, grid, simulated.imager.texture, flight.terrain, reach=14.0)
-        assert len(roads.road) > 100 and len(np.unique(roads.road)) >= 4
+        assert len(roads.road) > 60 and len(np.unique(roads.road)) >= 3
         off[name] = roads.rms()
     assert off["measured"] > 3.0
     assert off["final"] < 0.3
@@ -278,7 +278,7 @@ def test_lines_have_the_poses_of_their_own_strip_where_two_are_imaged_at_the_sam
     np.testing.assert_array_equal(own.to_numpy(), alone.to_numpy())
     n = min(len(other), len(alone) // 2)  # each second line at the same time
     off = other[["X_m", "Y_m", "Z_m"]].to_numpy()[:n] - alone[["X_m", "Y_m", "Z_m"]].to_numpy()[::2][:n]
-    assert n > 200 and np.linalg.norm(off, axis=1) == pytest.approx(np.full(n, 100.0), abs=0.1)  # scale of the CRS
+    assert n > 150 and np.linalg.norm(off, axis=1) == pytest.approx(np.full(n, 100.0), abs=0.1)  # scale of the CRS
     images = []
     for path in (flown, beside):
         _rectify(capsys, path, folder / "strip.tif", "--strip", "S1", "--gsd", 8, "--height", 0)
@@ -563,7 +563,7 @@ def test_lost_blocks_leave_a_hole_and_are_told(flown, folder, capsys):
     gone = 0
     with RecordingWriter(folder / "holes.mcap") as writer:
         for message in RecordingReader(flown).sorted_messages():
-            if message.topic == "sensor/lines/N" and 300 <= message.body.first_line < 340:
+            if message.topic == "sensor/lines/N" and 200 <= message.body.first_line < 240:
                 gone += len(message.body.pixels)
             elif message.topic.startswith(
                 ("configuration", "sensor/lines/N", "truth/trajectory", "observation/control")
@@ -692,7 +692,7 @@ def test_poses_that_are_not_valid_give_no_orientation(flown, folder, capsys):
     assert result["orientation"] == "measured" and result["poses_not_valid"] == lost > 10
     total = next(iter(Recording(flown).last_strips().values())).lines
     left, there = result["left_out"]["without orientation"], sum(result["strips"].values())
-    assert left + there == total and left == pytest.approx(8.0 * total / 14.0, abs=0.02 * total)
+    assert left + there == total and left == pytest.approx(8.0 * total / SETTINGS["seconds"], abs=0.02 * total)
     table = folder / "aligning.csv"
     assert main(["export", str(folder / "aligning.mcap"), "--per-line", str(table)]) == 0
     assert f"{lost} poses left out, not valid" in capsys.readouterr().out
@@ -949,7 +949,7 @@ def test_node_draws_with_the_camera_that_goes_with_the_orientations(flown):
     told = [m.ParameterEstimate(name="dc", value=0.05), m.ParameterEstimate(name="yp_N", value=0.1)]
     camera, n = estimated_camera(camera_from(reader.first("configuration/camera")), told)
     assert n == 2
-    end_ns = reader.first("configuration/strip").first_line_time_ns + 14 * 10**9
+    end_ns = reader.first("configuration/strip").first_line_time_ns + 8 * 10**9
     tiles = {}
     for name in ("stated", "reported", "calibrated"):
         node, newest = Rectifier(), {}
@@ -967,8 +967,10 @@ def test_node_draws_with_the_camera_that_goes_with_the_orientations(flown):
     assert tiles["reported"].keys() == tiles["calibrated"].keys()
     for key, tile in tiles["calibrated"].items():
         np.testing.assert_array_equal(tiles["reported"][key], tile)
-    common = tiles["stated"].keys() & tiles["reported"].keys()
-    assert max((tiles["stated"][key] != tiles["reported"][key]).mean() for key in common) > 0.3
+    pairs = [
+        (tiles["stated"][key], tiles["reported"][key]) for key in tiles["stated"].keys() & tiles["reported"].keys()
+    ]
+    assert max((a != b)[(a > 0) | (b > 0)].mean() for a, b in pairs) > 0.3  # of the cells that are drawn
 
 
 def test_node_begins_again_in_another_local_frame(flown):
