@@ -4,6 +4,7 @@ Before, points were 4 m off in height with sigmas of centimetres, and nothing sa
 """
 
 import json
+import shutil
 
 import numpy as np
 import pandas as pd
@@ -44,15 +45,20 @@ def test_parameters_without_weight_keep_the_other_unknowns(capsys):
 
 @needs_blocks
 def test_a_camera_that_was_never_calibrated(tmp_path):
-    flight, done = tmp_path / "flight.mcap", tmp_path / "done.mcap"
-    assert main(["import", str(BLOCKS / "selfcal"), "-o", str(flight), "-q"]) == 0
+    """The two strips side by side, of four."""
+    folder, flight, done = tmp_path / "two", tmp_path / "flight.mcap", tmp_path / "done.mcap"
+    shutil.copytree(BLOCKS / "selfcal", folder, copy_function=shutil.copyfile)
+    for name in ("strips.csv", "trajectory.csv", "image_points.csv"):
+        table = pd.read_csv(folder / name, dtype=str)
+        table[table["strip"].isin(["S1", "S2"])].to_csv(folder / name, index=False)
+    assert main(["import", str(folder), "-o", str(flight), "-q"]) == 0
     assert main(["process", str(flight), "-o", str(done), "-q"]) == 0
     truth = json.loads((BLOCKS / "selfcal" / "truth.json").read_text())["points"]
     recording = Recording(done)
     whole = {m.body.point: m.body for m in recording.messages("point/object") if m.body.status == m.body.WHOLE}
     assert len(whole) > 0.95 * len(truth)
     error = np.array([[p.x, p.y, p.z] for p in whole.values()]) - [truth[name] for name in whole]
-    assert (np.sqrt((error**2).mean(axis=0)) < (0.04, 0.04, 0.08)).all()
+    assert (np.sqrt((error**2).mean(axis=0)) < (0.04, 0.05, 0.1)).all()
     C = np.array([p.covariance for p in whole.values()]).reshape(-1, 3, 3)
     nees = np.einsum("ni,ni->n", error, np.linalg.solve(C, error[:, :, None])[:, :, 0]) / 3.0
     assert 0.6 < nees.mean() < 1.6
