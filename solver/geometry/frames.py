@@ -26,6 +26,8 @@ Array = NDArray[np.floating]
 GEOGRAPHIC = "geographic"
 #: No point lies deeper, m: coordinates of a map, taken for geocentric ones, lie about the centre of the Earth.
 DEEPEST_M = -1e5
+#: Heights above two ellipsoids that differ by no more, m, are those above the same one, but for rounding.
+SAME_ELLIPSOID_M = 1e-3
 #: Axes X and Y that make a left-handed system with heights: it is a mirror image, and no angles turn an image to it.
 _LEFT_HANDED = (("south", "west"), ("west", "north"), ("east", "south"))
 #: WKT or a PROJ string with the code of a vertical CRS behind it.
@@ -310,6 +312,26 @@ def _circle(crs) -> float:
     return 2.0 * np.pi / crs.axis_info[0].unit_conversion_factor
 
 
+class _HeightsOfWGS84:
+    """A transformer of a CRS without heights: these count from the ellipsoid of WGS 84, as those of GNSS do.
+
+    PROJ takes them from the ellipsoid of the CRS, 40 to 50 m from it in national systems of Europe; and where it has an
+    operation in the plane alone, as in parts of EPSG:5514, from WGS 84's, with a step between.
+    """
+
+    def __init__(self, of_own_ellipsoid):
+        self._transformer = of_own_ellipsoid
+
+    def transform(self, x, y, z, direction="FORWARD"):
+        """Longitude, latitude and height of east, north and height, or the reverse; as of PROJ."""
+        first, second, third = self._transformer.transform(x, y, z, direction=direction)
+        above = np.subtract(third, z)
+        if direction == "FORWARD" and (np.abs(above) > SAME_ELLIPSOID_M).any():
+            # the places have other heights above the ellipsoid of the CRS
+            first, second, _ = self._transformer.transform(x, y, np.subtract(z, above))
+        return first, second, np.where(np.isfinite(third), z, third)[()]
+
+
 def _transformer(crs):
     """To WGS 84 with ellipsoidal heights; where PROJ has the geoid of the heights, of its area alone.
 
@@ -324,7 +346,9 @@ def _transformer(crs):
         except pyproj.exceptions.ProjError:  # it has not; that is told by whoever reads the CRS
             pass
     try:
-        return pyproj.Transformer.from_crs(crs.to_3d() if len(crs.axis_info) < 3 else crs, target, always_xy=True)
+        if len(crs.axis_info) < 3:
+            return _HeightsOfWGS84(pyproj.Transformer.from_crs(crs.to_3d(), target, always_xy=True))
+        return pyproj.Transformer.from_crs(crs, target, always_xy=True)
     except pyproj.exceptions.ProjError as error:
         raise CrsError(f"PROJ cannot transform {crs.name!r} to WGS 84: {str(error).splitlines()[0]}") from None
 

@@ -246,3 +246,28 @@ def test_heights_end_where_their_geoid_ends(tmp_path):
 )
 def test_how_far_a_place_is_outside_the_area_of_a_crs(crs, place, outside_deg):
     assert outside_area(crs, *place)[0] == pytest.approx(outside_deg, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("crs", "lat", "lons", "back_m"),
+    [
+        ("EPSG:2056", 47.0, (7.0, 8.0), 1e-5),
+        ("EPSG:5514", 49.0, (18.5, 19.5), 0.01),  # PROJ itself takes it back to 5 mm
+        ("EPSG:4807", 47.0, (1.0, 2.0), 1e-5),
+    ],
+    ids=["Swiss", "Krovak, where PROJ changes operation", "Paris, grads"],
+)
+def test_heights_in_a_crs_without_heights_are_those_of_gnss(crs, lat, lons, back_m):
+    """PROJ takes them from the ellipsoid of the CRS, 45 m away, and in a part of EPSG:5514 not: a step in a block."""
+    at = np.array([[lat, lon, h] for lon in lons for h in (0.0, 600.0, 3000.0)])
+    frame = LocalFrame(lat, lons[0], 0.0, crs)
+    position = frame.from_geodetic(*at.T)
+    in_crs = frame.to_crs(position)
+    np.testing.assert_allclose(in_crs[:, 2], at[:, 2], atol=1e-6)
+    np.testing.assert_allclose(frame.from_crs(in_crs), position, atol=back_m)
+    whole = pyproj.Transformer.from_crs(pyproj.CRS(crs).to_3d(), "EPSG:4979", always_xy=True)
+    x, y, _ = whole.transform(at[:, 1], at[:, 0], at[:, 2], direction="INVERSE")
+    np.testing.assert_allclose(in_crs[:, 0], x, atol=1e-6)
+    np.testing.assert_allclose(in_crs[:, 1], y, atol=1e-6)
+    one = LocalFrame.around(in_crs[1], crs)
+    np.testing.assert_allclose([one.lat_deg, one.lon_deg], at[1, :2], atol=1e-6)
