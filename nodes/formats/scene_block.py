@@ -387,7 +387,7 @@ def _ground(folder: Path, crs: str, ellipsoid: Ellipsoid, notes: list[str]) -> t
         table = read_table(path, GROUND, notes, may_be_empty=True)
     rows = len(table) if table.values else 0
     if not rows:
-        notes.append("ground_points.csv: no points: the block stands on its orbits alone")
+        notes.append("ground_points.csv: no points: the block stands on its orbits or polynomials alone")
     if crs == GEOGRAPHIC:
         frame: Frame = BodyFrame(ellipsoid)
     else:

@@ -317,7 +317,7 @@ class Matcher(Node):
                 f"{strip}: no tie point at {tried} places; {where}If its height is known, give ground_m in [matcher]"
             ]
         return [
-            f"{strip}: no tie point at {tried} places; the ground is taken to be at {ground_m:.0f} m in the "
+            f"{strip}: no tie point at {tried} places; the ground is taken to be at {round(ground_m)} m in the "
             "local frame: if it is not, give ground_m in [matcher]"
         ]
 

@@ -322,7 +322,7 @@ def test_ties_do_not_hang_on_the_height_of_the_origin(tmp_path, short, by_m, con
     assert control != any("the ground was found at about" in text for text in told)
 
 
-@pytest.mark.parametrize("ground_m", [None, pytest.param(0.0, marks=pytest.mark.study)])
+@pytest.mark.parametrize("ground_m", [None, pytest.param(-0.3, marks=pytest.mark.study)])
 def test_where_nothing_matches_a_line_says_what_to_give(tmp_path, short, ground_m):
     def other(ccd, line, pixels):
         return pixels if ccd == "N" else pixels[:, ::-1].copy()
