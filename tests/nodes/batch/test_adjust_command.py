@@ -342,7 +342,8 @@ def test_image_points_in_a_gap_of_the_trajectory_have_no_orientation(tmp_path):
 def test_what_an_inertial_filter_does_not_know_is_no_noise_of_single_poses(tmp_path):
     """Its attitudes are uncertain to tenths of a degree, and alike for long: points were 1.6, 3.2 and 5.3 m off."""
     flight, oriented = tmp_path / "flight.mcap", tmp_path / "oriented.mcap"
-    assert main(["simulate", "-o", str(flight), "--imu", "mems", "--seconds", "40", "--seed", "3", "-q"]) == 0
+    words = ["--imu", "mems", "--imu-rate", "100", "--seconds", "25", "--seed", "3", "-q"]
+    assert main(["simulate", "-o", str(flight), *words]) == 0
     assert main(["process", str(flight), "-o", str(oriented), "--nodes", "navigator", "-q"]) == 0
     assert adjust(oriented, "-q", "-o", tmp_path / "out") == 0
     result = result_in(tmp_path / "out")

@@ -314,7 +314,7 @@ def test_the_usual_pace_of_process_keeps_that_of_the_results_in_a_recording(caps
         return json.loads(out)["pace"], (tmp_path / name).read_bytes()
 
     flight = tmp_path / "flight.mcap"
-    short = ["--seconds", 8, "--lead-in", 1, "--lead-out", 0.5, "--seed", 2]
+    short = ["--seconds", 6, "--lead-in", 1, "--lead-out", 0.5, "--attitude-rate", 50, "--seed", 2]
     assert run(capsys, "simulate", "-o", flight, *short, "-q")[0] == 0
     pace, fast = processed(flight, "fast.mcap")
     assert (pace, fast) == ("throughput", processed(flight, "asked.mcap", "--pace", "throughput")[1])
