@@ -310,8 +310,8 @@ def test_defaults_unknown_columns_and_missing_files(tmp_path, capsys):
 
 def test_navigate_over_a_recording(tmp_path, capsys):
     recording = tmp_path / "flight.mcap"
-    arguments = ["--strips", "2", "--cross", "0", "--seconds", "25", "--seed", "3", "--imu", "tactical", "-q"]
-    assert main(["simulate", "-o", str(recording), *arguments]) == 0
+    arguments = ["--strips", "2", "--cross", "0", "--seconds", "25", "--seed", "3", "-q"]
+    assert main(["simulate", "-o", str(recording), *arguments, "--imu", "tactical", "--imu-rate", "100"]) == 0
     capsys.readouterr()
     assert main(["navigate", str(recording), "-o", str(tmp_path / "out"), "--json", "--no-page", "--rate", "10"]) == 0
     result = json.loads(capsys.readouterr().out)

@@ -202,7 +202,9 @@ def test_strips_without_the_turns_between_them_accuse_no_clock(seed):
     assert not any("clock" in text for text in events) and not node.counters["gnss of another clock"]
 
 
-@pytest.mark.parametrize(("offset_s", "imu"), [(0.1, True), (0.9, True), (0.9, False)])
+@pytest.mark.parametrize(
+    ("offset_s", "imu"), [(0.1, True), pytest.param(0.9, True, marks=pytest.mark.study), (0.9, False)]
+)
 def test_tenths_of_a_second_are_named_after_a_turn_and_corrected_on_the_operators_word(offset_s, imu):
     messages = late_receiver(offset_s, imu)
     node, events, poses = heard(messages)

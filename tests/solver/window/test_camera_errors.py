@@ -79,7 +79,7 @@ def test_the_displacement_that_is_most_certain():
     assert worst.ccd == "F" and worst.off_px == pytest.approx(0.13 / pitch_mm, rel=0.01)
 
 
-@pytest.mark.parametrize("share", [0.01, 0.1])
+@pytest.mark.parametrize("share", [pytest.param(0.01, marks=pytest.mark.study), 0.1])
 def test_a_camera_that_is_worse_than_calibrated_is_estimated(share):
     """With the focal length alone some pixels of distortion made points metres wrong, worse than direct
     georeferencing."""
