@@ -271,20 +271,20 @@ class LiveFlight:
 
     @staticmethod
     def _wait_until_worked_off(node: NodeProcess, overview: Overview, show: Callable[[], None], until: float) -> None:
-        """Return when three statuses in a row tell of no message received or worked off between them.
+        """Return when two statuses in a row tell of no message received or worked off between them.
 
         At ``until`` (of `time.monotonic`) it returns all the same, but leaves those before it in the data flow
         `ON_THE_WAY_S` for their last messages.
         """
         until = max(until, time.monotonic() + ON_THE_WAY_S)
-        said, still, received, queued = overview.said[node.name], 0, -1, 0
-        while node.running and still < 2 and time.monotonic() < until:
+        said, still, received, queued = overview.said[node.name], False, -1, 0
+        while node.running and not still and time.monotonic() < until:
             time.sleep(0.1)
             show()
             if overview.said[node.name] > said:
                 said, status = overview.said[node.name], overview.nodes[node.name]
                 before, received = received, sum(t.received for t in status.topics if not t.topic.startswith("status/"))
-                still = still + 1 if received == before and status.queued >= queued else 0
+                still = received == before and status.queued >= queued
                 queued = status.queued
 
     @contextmanager
