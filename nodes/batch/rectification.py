@@ -45,8 +45,8 @@ ORIENTATIONS: dict[str, str] = {
 }
 #: Those that an adjustment has refined, with the camera that it estimated.
 REFINED = ("whole", "final", "live")
-#: Lines and pixels from one to the next whose rays tell whether a block of lines sees a part of the ground, and so many
-#: cells round it are looked at, besides a share of what the block sees: ground between those rays is nearly as high.
+#: Each so many-th line, and of it each so many-th ray, tell whether a block of lines sees a part of the ground. It does
+#: if what they see, so many cells wider and a share of its length, meets the part: relief between them bulges.
 LOOK_LINES, LOOK_RAYS, ROUND_CELLS, ROUND_SHARE = 16, 4, 16.0, 0.05
 #: Lines that are missing are left black, so that the others stay in their places, if there are not more than this.
 LARGEST_GAP = 5000
