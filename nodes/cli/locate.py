@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,8 @@ _GROUND = (Column("lon_deg", low=-360.0), Column("lat_deg", low=-90.0))
 _HEIGHT = Column("height_m")
 #: With a raster of heights the column may be missing, and is not used.
 _NO_HEIGHT = Column("height_m", optional=True, blank=True)
+#: Note of a row without a place.
+NOTHING_GIVEN = "nothing given"
 #: An RPC is told to be beyond its heights where they are so many times as far from their middle as half of their range.
 #: Tuned: polynomials are as good as inside for a fifth more, and no place hangs on it.
 EXTRAPOLATED = 1.5
@@ -191,7 +194,14 @@ def _terrain(args: argparse.Namespace, model: Model) -> HeightRaster | None:
 
 
 def _table(path: Path, columns: tuple[Column, ...], terrain: HeightRaster | None, notes: list[str]) -> Table:
-    table = read_table(path, (*columns, _HEIGHT if terrain is None else _NO_HEIGHT), notes)
+    """The rows of a file; those without a place, as they are written for what misses, stay so."""
+    needed = columns if terrain is not None else (*columns, _HEIGHT)
+    more = () if terrain is None else (_NO_HEIGHT,)
+    table = read_table(path, [*(replace(column, blank=True) for column in needed), *more], notes)
+    empty = np.logical_and.reduce([np.isnan(table[column.name]) for column in columns])
+    for column in needed:
+        missing = np.isnan(table[column.name]) & ~empty
+        table.refuse(missing, column.name, lambda row: "missing, wanted a number")
     if terrain is not None and "height_m" in table and np.isfinite(table["height_m"]).any():
         notes.append(f"{path}: height_m is not used: heights are those of {terrain.name}")
     return table
@@ -203,6 +213,7 @@ def _to_ground(
     table = _table(path, _PIXELS, terrain, notes)
     u, v = table["row"], table["column"]
     note = _outside(model, u, v)
+    note[np.isnan(u)] = NOTHING_GIVEN
     inside = np.flatnonzero(note == "")
     located, slope = np.full((len(u), 3), np.nan), None
     if terrain is None:
@@ -293,7 +304,9 @@ def _to_pixels(
         )
     table.refuse(np.abs(table["lat_deg"]) > 90.0, "lat_deg", lambda row: "a latitude beyond 90 degrees")
     lat, lon = np.radians(table["lat_deg"]), np.radians(table["lon_deg"])
-    h = table["height_m"] if terrain is None else terrain.at(lat, lon)
+    given = np.isfinite(lat)
+    h = np.full(len(lat), np.nan)
+    h[given] = table["height_m"][given] if terrain is None else terrain.at(lat[given], lon[given])
     known = np.isfinite(h)
     pixel = np.full((len(h), 2), np.nan)
     pixel[known] = model.inverse(lat[known], lon[known], h[known], 0.0)
@@ -301,6 +314,7 @@ def _to_pixels(
     note = np.full(len(pixel), "not in the image", dtype=object)
     if terrain is not None:
         note[~known] = f"no height of {terrain.name} there"
+    note[~given] = NOTHING_GIVEN
     note[seen] = ""
     columns: dict[str, Any] = {
         "lon_deg": table["lon_deg"], "lat_deg": table["lat_deg"], "height_m": h,

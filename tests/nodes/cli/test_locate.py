@@ -60,10 +60,22 @@ def test_rows_that_miss_are_empty_with_a_note(scene, tmp_path, capsys):
     table = pd.read_csv(ground)
     assert table["lon_deg"].isna().tolist() == [False, True, True]
     assert table["note"].tolist()[1:] == ["outside the image of 500 columns and 4000 rows", "the ray misses the ground"]
+    assert main(["locate", str(scene), "--ground", str(ground), "-o", str(back), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["missed"] == 2
+    again = pd.read_csv(back)
+    assert (
+        again["column"].isna().tolist() == [False, True, True] and again["note"].tolist()[1:] == ["nothing given"] * 2
+    )
     (tmp_path / "far.csv").write_text("lon_deg,lat_deg,height_m\n0,0,0\n")
     assert main(["locate", str(scene), "--ground", str(tmp_path / "far.csv"), "-o", str(back), "-q"]) == 0
     row = pd.read_csv(back).iloc[0]
     assert pd.isna(row["column"]) and row["note"] == "not in the image"
+    assert main(["locate", str(scene), "--pixels", str(back), "-o", str(ground), "-q"]) == 0
+    assert pd.read_csv(ground)["note"].tolist() == ["nothing given"]
+    for row, what in (("1,,0", "lat_deg"), (",1,0", "lon_deg"), ("1,1,", "height_m")):
+        (tmp_path / "part.csv").write_text(f"lon_deg,lat_deg,height_m\n0,0,0\n{row}\n")
+        assert main(["locate", str(scene), "--ground", str(tmp_path / "part.csv"), "-o", str(back), "-q"]) == 1
+        assert f"part.csv:3: {what}: missing, wanted a number" in capsys.readouterr().err
 
 
 def test_sigmas_of_the_command_line_and_of_the_scene(scene, tmp_path):
