@@ -31,8 +31,8 @@ WAITING = ("tests/test_demo.py", "tests/nodes/sensors/test_fly.py", "tests/test_
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_make_collect_report(collector):
-    """Each worker of pytest-xdist imports the tests in another order: where they are not compiled yet, each file is by
-    one worker, and not by all of them at the same time."""
+    """Each worker of pytest-xdist imports the tests in another order, so that in a fresh clone each file is compiled by
+    one of them, and not by all at the same time."""
     report = (yield).get_result()
     worker = os.environ.get("PYTEST_XDIST_WORKER")
     if worker and isinstance(collector, pytest.Session | pytest.Directory):

@@ -78,6 +78,7 @@ class Bundle:
 
     @property
     def is_desk(self) -> bool:
+        """Whether it is of a program that reads, and publishes nothing but verdicts."""
         return self.kind == DESK
 
     @property

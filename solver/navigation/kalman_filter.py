@@ -45,7 +45,7 @@ class _StandIn(ModuleType):
 
 @cache
 def kalman_filter() -> type[Any]:
-    """The class `filterpy.kalman.KalmanFilter`."""
+    """The class `filterpy.kalman.KalmanFilter`. No other thread may import these modules of SciPy meanwhile."""
     stand_ins = {module: _StandIn(module, names) for module, names in _TAKEN.items() if module not in sys.modules}
     sys.modules.update(stand_ins)
     try:

@@ -42,12 +42,12 @@ def test_there_and_back(scene, tmp_path, capsys):
 
 
 def test_heights_far_beyond_those_of_an_rpc_are_told(scene, tmp_path, capsys):
-    """At 50 km its polynomials are hundreds of metres off, and nothing said so."""
+    """At 50 km the polynomials of a Pleiades image are hundreds of metres off, and nothing said so."""
     write_rpb(tmp_path / "scene.RPB", fit_to_model(read_scene(scene).model("rigorous"), 0.0, 500.0).rpc)
     words = ["locate", str(tmp_path / "scene.RPB"), "-o", str(tmp_path / "out.csv"), "--json", "--pixels"]
-    assert main([*words, str(pixels(tmp_path, "0,0,0\n10,10,500\n20,20,600\n"))]) == 0
+    assert main([*words, str(pixels(tmp_path, "0,0,0\n10,10,500\n20,20,900\n"))]) == 0
     assert json.loads(capsys.readouterr().out)["notes"] == []
-    assert main([*words, str(pixels(tmp_path, "0,0,0\n10,10,900\n20,20,50000\n"))]) == 0
+    assert main([*words, str(pixels(tmp_path, "0,0,0\n10,10,1100\n20,20,50000\n"))]) == 0
     (note,) = json.loads(capsys.readouterr().out)["notes"]
     assert note.startswith("heights of 2 rows, up to 50000 m, lie beyond those that the RPC was made for (0 to 500 m)")
 
