@@ -90,7 +90,7 @@ def _recording(flight: Flight, held: Holdings) -> dict[str, Any]:
         "project": flight.project.name if flight.project is not None else None,
         "camera": flight.camera.name if flight.camera is not None else None,
         "strips": len(flight.strips),
-        "tie_points": len({look.point for look in flight.looks}),
+        "tie_points": len({look.point for look in flight.looks} - flight.ground.keys()),
         "rays": len(flight.looks),
         "control_points": sum(role != "check" for role in roles),
         "check_points": sum(role == "check" for role in roles),

@@ -88,7 +88,7 @@ def _tiles(result: dict[str, Any]) -> list[tuple[str, str, str]]:
             low, high = min(better[key]), max(better[key])
             times = "–".join(dict.fromkeys((f"{low:.1f}", f"{high:.1f}")))
             tiles.append((f"{times} ×", f"better {text} than direct georeferencing", "good" if low > 1 else "bad"))
-    tiles.append((f"{recording['tie_points']}", f"object points in {recording['rays']} rays", ""))
+    tiles.append((f"{recording['tie_points']}", f"tie points; {recording['rays']} rays of all points", ""))
     tiles.append((f"{recording['control_points']} / {recording['check_points']}", "control / check points", ""))
     if "latency_s" in result:
         text = "from the newest ray to the result that contains it, median"

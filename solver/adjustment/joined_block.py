@@ -1,8 +1,9 @@
 """Several recordings of one block (days, aircraft) as one block.
 
 Points with the same name are one point: known points as they are; tie points only where the rays of the recordings meet
-near each other, since names that a matcher gave may come again elsewhere. Strips keep their own corrections, and the
-a-priori sigmas of their recording.
+near each other, and near the same way as at their neighbours, since names that a matcher gave come again for other
+points, on the same flight line not even far away. Strips keep their own corrections, and the a-priori sigmas of their
+recording.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Array, IntArray
+from ..arrays import Array, Bools, IntArray
 from ..geometry.frames import LocalFrame
 from ..geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
 from ..geometry.trajectory import Trajectory
@@ -24,6 +25,10 @@ from .network import Strip
 #: Tie points of one name farther apart than this share of the height above ground are different points. Measured
 #: orientation errs by less, and a single look says no more; a name that comes again by chance lies anywhere.
 APART = 0.05
+#: Where orientation errs, neighbouring points are off by much the same: where names mean the same, by hundredths of
+#: APART more or less (0.02 with half a degree of boresight); where they come again by chance, by about APART. It is
+#: chance where the middle difference is above this share of APART, or less than this share of the points near. Tuned.
+UNLIKE, MOSTLY = 0.3, 0.5
 #: Known coordinates of one name differ by less than this, m, or somebody is wrong; so do their sigmas, or it is told.
 SAME_M = 1e-3
 
@@ -265,27 +270,53 @@ def _point_names(
     at: dict[str, Array] = {}
     place, places, elsewhere = dict(known), [], 0
     for i, block in enumerate(blocks):
-        own = _positions(block, shared) if shared else {}
-        mine = np.empty(len(block.point_ids), dtype=np.int64)
-        for k, id in enumerate(block.point_ids):
-            if id in shared and id in own:
-                xyz, reach = own[id]
-                if id not in at:
-                    at[id] = xyz
-                elif np.linalg.norm(xyz - at[id]) > reach:
-                    elsewhere += 1
-                    id = f"{id}@{names[i]}"
-            mine[k] = place.setdefault(id, len(place))
-        places.append(mine)
+        own, reach = _positions(block, shared) if shared else ({}, 0.0)
+        of_kind: dict[str, list[str]] = {}  # those who give names number them: S1-M1, S1-M2
+        for id in own:
+            if id in at:
+                of_kind.setdefault(id.rstrip("0123456789"), []).append(id)
+        others = set[str]()
+        for ids in of_kind.values():
+            apart = other_points(np.array([own[id] for id in ids]), np.array([at[id] for id in ids]), reach)
+            others.update(id for id, other in zip(ids, apart.tolist(), strict=True) if other)
+        at |= {id: xyz for id, xyz in own.items() if id not in at}
+        elsewhere += len(others)
+        named = [f"{id}@{names[i]}" if id in others else id for id in block.point_ids]
+        places.append(np.array([place.setdefault(id, len(place)) for id in named], dtype=np.int64))
     return tuple(place), places, elsewhere
 
 
-def _positions(block: BlockData, wanted: set[str]) -> dict[str, tuple[Array, float]]:
+def other_points(xyz: Array, known: Array, reach: float) -> Bools:
+    """Which points of a recording are others than those of the same name in the recordings before it.
+
+    Parameters
+    ----------
+    xyz, known : (N, 3) where each of them lies in the recording, and in those before, m
+    reach : points farther apart are others anyhow, m
+
+    Returns
+    -------
+    (N,) truth values
+    """
+    from scipy.spatial import cKDTree
+
+    off = xyz - known
+    near = np.linalg.norm(off, axis=1) <= reach
+    if near.sum() < MOSTLY * len(near):
+        return np.ones(len(near), dtype=bool)
+    if near.sum() > 2:
+        _, pairs = cKDTree(known[near]).query(known[near], k=2)
+        if np.median(np.linalg.norm(np.diff(off[near][pairs], axis=1), axis=2)) > UNLIKE * reach:
+            return np.ones(len(near), dtype=bool)
+    return ~near
+
+
+def _positions(block: BlockData, wanted: set[str]) -> tuple[dict[str, Array], float]:
     """Where the measured rays of some points meet, and how far away another recording may see them."""
     some = np.array([id in wanted for id in block.point_ids], dtype=bool)
     rows = np.flatnonzero(some[block.image.point])
     if not len(rows):
-        return {}
+        return {}, 0.0
     image = block.image
     of_sample = None if image.sigma_sample_px is None else image.sigma_sample_px[rows]
     few = ImagePoints(
@@ -295,10 +326,10 @@ def _positions(block: BlockData, wanted: set[str]) -> dict[str, tuple[Array, flo
     try:
         network = network_from_block(replace(block, image=few))
     except ValueError:  # no ray that could be used
-        return {}
+        return {}, 0.0
     above = float(np.median(network.rays.position_l[:, 2] - network.approximate_l[network.rays.point, 2]))
-    reach = APART * max(above, 0.0)
-    return {id: (network.approximate_l[k], reach) for k, id in enumerate(network.point_ids) if id in wanted}
+    places = {id: network.approximate_l[k] for k, id in enumerate(network.point_ids) if id in wanted}
+    return places, APART * max(above, 0.0)
 
 
 def _image(blocks: Sequence[BlockData], places: Sequence[IntArray], first_strip: IntArray) -> ImagePoints:

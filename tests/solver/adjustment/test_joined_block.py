@@ -12,9 +12,10 @@ from triline.nodes.errors import UserError
 from triline.solver.adjustment.adjustment import adjust
 from triline.solver.adjustment.block_data import BlockData, ImagePoints, KnownPoints, network_from_block
 from triline.solver.adjustment.covariance import cofactors
-from triline.solver.adjustment.joined_block import join_blocks
+from triline.solver.adjustment.joined_block import join_blocks, other_points
 from triline.solver.adjustment.options_by_strip import OptionsByStrip
 from triline.solver.geometry.frames import LocalFrame
+from triline.solver.geometry.rotation import quaternion_multiply
 from triline.solver.geometry.trajectory import Trajectory
 from triline.solver.models.dgr import DgrOptions
 from triline.solver.simulation.network import regular_block
@@ -104,6 +105,64 @@ def test_names_that_come_again(block):
     assert {f"{block.point_ids[a]}@day2", f"{block.point_ids[b]}@day2"} <= set(joined.block.point_ids)
     solution, _, _ = answers(joined.block)
     assert solution.sigma0 < 1.2
+
+
+def of_another_seed(block, seed):
+    """Names of the tie points among those whose points lie near each other, as a matcher would give them anew."""
+    network = network_from_block(block)
+    place = {id: i for i, id in enumerate(network.point_ids)}
+    n, rng = len(block.ground), np.random.default_rng(seed)
+    names = list(block.point_ids)
+    ties = [id for id in names[n:] if id in place]
+    xyz = network.approximate_l[[place[id] for id in ties]]
+    left = set(range(len(ties)))
+    new = {}
+    for k in rng.permutation(len(ties)):
+        near = sorted(left, key=lambda j: float(np.linalg.norm(xyz[j] - xyz[k])))
+        new[ties[k]] = ties[near[int(rng.integers(min(3, len(near))))]]
+        left.discard(ties.index(new[ties[k]]))
+    return replace(block, point_ids=tuple(new.get(id, id) for id in names))
+
+
+def test_names_that_a_matcher_gave_again_on_the_same_flight_line(block):
+    """Other points of the same names, some of them less than 5 % of the height away: these were taken for the same."""
+    first, second = some_strips(block, [0, 1]), later(some_strips(block, [0, 1]), 64)
+    apart = join_blocks([first, of_another_seed(second, 3)], ["day1", "day2"])
+    ties = np.unique(second.image.point[second.image.point >= len(block.ground)])
+    assert apart.elsewhere == len(ties) and not apart.ties
+    solution, _, _ = answers(apart.block)
+    assert 0.85 < solution.sigma0 < 1.15
+
+
+def test_ties_of_a_trajectory_that_is_turned_are_ties(block):
+    """Half a degree of boresight moves the points of the second recording 17 m on the ground, all the same way."""
+    first, second = some_strips(block, [0, 1]), some_strips(block, [1, 2])
+    turn = np.array([np.sin(np.radians(0.25)), 0.0, 0.0, np.cos(np.radians(0.25))])
+    strips = tuple(
+        replace(
+            s,
+            trajectory=Trajectory(
+                s.trajectory.time_s, s.trajectory.position_l, quaternion_multiply(s.trajectory.quaternion, turn)
+            ),
+        )
+        for s in second.strips
+    )
+    straight = join_blocks([first, second], ["day1", "day2"])
+    joined = join_blocks([first, replace(second, strips=strips)], ["day1", "day2"])
+    assert straight.ties > 20 and joined.ties > 0.9 * straight.ties
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_points_all_near_each_other_that_are_not_off_by_the_same_are_others(seed):
+    rng, reach = np.random.default_rng(seed), 100.0
+    at = rng.uniform(0.0, 3000.0, (40, 3)) * (1.0, 0.3, 0.02)
+    chance = at + rng.uniform(0.0, 90.0, (40, 1)) ** 0.5 * rng.normal(0.0, 6.0, (40, 3)) * (1.0, 1.0, 0.3)
+    tied = at + np.array((60.0, -40.0, 10.0)) + rng.normal(0.0, 4.0, (40, 3))
+    tied[7] += (0.0, 900.0, 0.0)
+    near = np.linalg.norm(chance - at, axis=1) < reach
+    assert near.mean() > 0.6 and other_points(chance, at, reach).all()
+    assert np.flatnonzero(other_points(tied, at, reach)).tolist() == [7]
+    assert other_points(at[:1], at[:1], reach).tolist() == [False]
 
 
 def test_another_frame_is_turned_into_the_first(block):
