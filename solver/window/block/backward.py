@@ -53,7 +53,7 @@ class LeftPoints:
         ]
 
 
-@dataclass(frozen=True)
+@dataclass
 class LeftOrientation:
     """Orientation that became final.
 
@@ -62,11 +62,20 @@ class LeftOrientation:
     published : at n times
     design : how its corrections depend on the unknowns
     noise : (n, 6, 6) covariance that comes from none of them
+    vibration : of the attitude from look to look, rad, that is in it; NaN where looks were as noisy as stated
     """
 
     published: RefinedOrientation
     design: Design
     noise: Array
+    vibration: float
+
+    def vibrates(self, vibration: float) -> None:
+        """Noise of the looks has proved to be a vibration of the attitude, rad, since."""
+        if vibration > self.vibration:
+            more = vibration**2 - self.vibration**2
+            self.noise = self.noise + more * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+            self.vibration = vibration
 
     def refined(self, solution: Solution) -> RefinedOrientation:
         """The orientation as a solution of whole strips gives it."""

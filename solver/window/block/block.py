@@ -119,6 +119,9 @@ class Block:
     def gone(self, strip: WindowStrip) -> None:
         """Nothing of a strip is left in the window."""
         self.conclude()
+        if strip.id in self._archive.strips:
+            for orientation in self._archive.strips[strip.id].orientation:
+                orientation.vibrates(self._network.pose_noise.vibration)
         self._touched.discard(strip.id)
         self._archive.end_strip(strip)
         self._new.append(strip.id)
