@@ -193,6 +193,7 @@ class PoseNoise:
     usual : (6, 6) as `followed` gives it, where all rays have come; for the weights of rays that have just come
     version : how often that has changed clearly
     vibration : noise of the attitude from look to look beyond what is stated, rad
+    possible_vibration : the same, where noise of looks that may be of the image or of the attitude is taken for that
     """
 
     def __init__(self, trajectory: MeasuredTrajectory) -> None:
@@ -200,7 +201,7 @@ class PoseNoise:
         self._pieces: dict[int, Array] = {}
         self.usual: Array = np.eye(6)
         self.version = 0
-        self.vibration = 0.0
+        self.vibration = self.possible_vibration = 0.0
 
     def count(self, time_s: Array, information: Array) -> None:
         """Rays (n,) have come, with their information (n, 6, 6) (see `ray_information`)."""
@@ -227,10 +228,11 @@ class PoseNoise:
 
     def of_rays(self, measured: MeasuredPoses) -> Array:
         """Covariance (n, 6, 6) of the noise of orientation under rays."""
-        return self._vibrating(_with_left(measured, np.broadcast_to(self.usual, measured.covariance.shape)))
+        noise = _with_left(measured, np.broadcast_to(self.usual, measured.covariance.shape))
+        return noise + of_vibration(self.vibration)
 
     def at(self, measured: MeasuredPoses, density: Array) -> Array:
-        """Covariance (n, 6, 6) of the noise of corrected orientation."""
+        """Covariance (n, 6, 6) of the noise of corrected orientation, without a vibration."""
         piece = np.floor(measured.poses.time_s / PIECE_S).astype(np.int64)
         left = np.empty_like(measured.covariance)
         for k in np.unique(piece).tolist():
@@ -239,11 +241,12 @@ class PoseNoise:
             if information is not None:
                 of_piece = followed(information, density, self._trajectory.noise_time_s)
             left[piece == k] = of_piece
-        return self._vibrating(_with_left(measured, left))
+        return _with_left(measured, left)
 
-    def _vibrating(self, covariance: Array) -> Array:
-        """With the noise of the attitude from look to look."""
-        return covariance + self.vibration**2 * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+
+def of_vibration(vibration: float) -> Array:
+    """Covariance (6, 6) of a pose by noise of the attitude from look to look, rad."""
+    return np.diag([0.0, 0.0, 0.0, *[vibration**2] * 3])
 
 
 def _size(left: Array) -> float:

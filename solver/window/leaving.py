@@ -138,17 +138,16 @@ class Leaving:
         if final is not None:
             update.final.append(final)
             noise = self._orientation.noise(strip, final.time_s)
-            vibration = self._network.pose_noise.vibration
+            vibration, design = self._network.pose_noise.vibration, strip.design(final.time_s)
             noisier = vibration > 0.0 or self._network.sigmas.image > 1.0
-            design = strip.design(final.time_s)
-            left = LeftOrientation(final, design, noise, vibration if noisier else np.nan)
+            left = LeftOrientation(final, design, noise, vibration, noisier)
             self._block.orientation(strip, left)
         strip.final_to_s = to_s
         self._marginalise(numbers, left)
         if strip.ended and strip.is_gone(self._network.state):
             for step in self._steps:  # those of a strip that is no part of a block
                 if step.orientation is not None and step.orientation.published.strip == strip.id:
-                    step.orientation.vibrates(self._network.pose_noise.vibration)
+                    step.orientation.over(self._network.pose_noise.possible_vibration)
             self._block.gone(strip)
             strip.release()
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..adjustment.layout import SURFACE_SHIFT
+from ..adjustment.pose_noise import of_vibration
 from ..arrays import Array, IntArray
 from ..camera.self_calibration import unit_of
 from ..geometry.rotation import corrected_angles, matrix_from_angles
@@ -94,7 +95,8 @@ class OrientationOutput:
         correction, covariance = (np.concatenate([p[i] for p in parts]) for i in range(2))
         angles = corrected_angles(measured.poses.angles, correction[:, 3:])
         angles[:, 2] = (angles[:, 2] + np.pi) % (2 * np.pi) - np.pi
-        covariance = covariance + self._network.pose_noise.at(measured, strip.followed)
+        noise = self._network.pose_noise
+        covariance = covariance + noise.at(measured, strip.followed) + of_vibration(noise.possible_vibration)
         covariance += measured.open_end[:, :, None] * np.eye(6)
         return RefinedOrientation(
             strip.id, times, measured.poses.position_l + correction[:, :3], angles, covariance, correction
@@ -110,7 +112,8 @@ class OrientationOutput:
         return float(np.arccos(np.clip(0.5 * (np.sum(before * after) - 1.0), -1.0, 1.0)))
 
     def noise(self, strip: WindowStrip, times: Array) -> Array:
-        """Covariance (n, 6, 6) that comes from no unknown: measurement noise and what the model leaves out."""
+        """Covariance (n, 6, 6) that comes from no unknown and is no vibration: measurement noise and what the model
+        leaves out."""
         noise = self._network.pose_noise.at(self._network.trajectory.at(times), strip.followed)
         return noise + strip.model.left_out_variance(times)[:, :, None] * np.eye(6)
 

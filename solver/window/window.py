@@ -17,7 +17,7 @@ from heapq import nsmallest
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..adjustment.pose_noise import ray_information
+from ..adjustment.pose_noise import of_vibration, ray_information
 from ..adjustment.surface_control import SurfaceControl
 from ..arrays import Array
 from ..camera.line_camera import LineCamera
@@ -553,4 +553,4 @@ class Window:
         times = np.array([min(self._now_s, strip.end_s, self.trajectory.end_s)])
         if not np.isfinite(times[0]) or not self.trajectory.covers(times)[0]:
             return np.zeros((6, 6))
-        return self._orientation.noise(strip, times)[0]
+        return self._orientation.noise(strip, times)[0] + of_vibration(self.network.pose_noise.possible_vibration)

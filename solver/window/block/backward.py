@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from ...adjustment.eliminated_points import EliminatedPoints
+from ...adjustment.pose_noise import of_vibration
 from ...adjustment.reliability import CRITICAL_W
 from ...arrays import Array
 from ...geometry.rotation import corrected_angles
@@ -61,26 +62,26 @@ class LeftOrientation:
     ----------
     published : at n times
     design : how its corrections depend on the unknowns
-    noise : (n, 6, 6) covariance that comes from none of them
-    vibration : of the attitude from look to look, rad, that is in it; NaN where looks were as noisy as stated
+    noise : (n, 6, 6) covariance that comes from none of them, and is no vibration
+    vibration : of the attitude from look to look, rad, as it was known then
+    noisier : whether looks were noisier than stated then
     """
 
     published: RefinedOrientation
     design: Design
     noise: Array
     vibration: float
+    noisier: bool
 
-    def vibrates(self, vibration: float) -> None:
-        """Noise of the looks has proved to be a vibration of the attitude, rad, since."""
-        if vibration > self.vibration:
-            more = vibration**2 - self.vibration**2
-            self.noise = self.noise + more * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
-            self.vibration = vibration
+    def over(self, vibration: float) -> None:
+        """The strip is over, and noise of its looks is, or may be, a vibration of the attitude, rad."""
+        if self.noisier:
+            self.vibration = max(self.vibration, vibration)
 
     def refined(self, solution: Solution) -> RefinedOrientation:
         """The orientation as a solution of whole strips gives it."""
         old, n = self.published, len(self.published.time_s)
-        change, covariance = -old.correction, self.noise.copy()
+        change, covariance = -old.correction, self.noise + of_vibration(self.vibration)
         for part in (slice(i, i + REFINED_AT_ONCE) for i in range(0, n, REFINED_AT_ONCE)):
             columns, A = self.design.part(part).functions()
             theta, Q = solution.of(columns)

@@ -2,8 +2,9 @@
 
 The image has a factor, from the median of squared normalised residuals, which gross errors do not move much. Where
 looks at different points, taken at nearly the same time, have much of it in common it is no noise of the image: the
-attitude vibrates. It is stated as noise of the attitude then, so that the orientation says it, too. What lasts longer
-is a wander of the trajectory.
+attitude vibrates. It is stated as noise of the attitude then, so that the orientation says it, too. As long as the
+looks are too few to tell, and far noisier than stated, it may vibrate, and the orientation says that as well. What
+lasts longer is a wander of the trajectory.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ TOGETHER_S, LEAST_PAIRS, SIGNIFICANT, STILL_SIGNIFICANT, OUTLYING, LEAST_VIBRATI
 #: All noise beyond that of the image is vibration where looks have more than this share of their variance in common;
 #: so much of what they had is kept at least from one look to the next. Tuned.
 VIBRATES, SHARE_KEPT = 0.3, 0.9
+#: An image seldom has so many times the noise that its matcher states: beyond that the attitude may vibrate, unless the
+#: share in common is below VIBRATES by so many standard deviations. Tuned.
+MAY_VIBRATE, SURELY = 3.0, 2.0
 #: Batches that are looked at then, the newest ones.
 MOST_JUDGED = 120
 #: Looks so far apart, s, that have this share of their variance in common show a wander. Tuned.
@@ -42,7 +46,7 @@ class NoiseOfLooks:
 
     def __init__(self, network: LiveNetwork) -> None:
         self._network = network
-        self._shared = 0.0
+        self._shared, self._of_the_image = 0.0, False
 
     def known(self) -> LookNoise | None:
         """What the looks say with the noise that is stated now; None while some have the weights of another one."""
@@ -117,8 +121,10 @@ class NoiseOfLooks:
     def restate(self, found: Residuals) -> bool:
         """State the noise of looks as residuals ask for; whether it changed."""
         sigmas, noise, pixel, sigma = self._network.sigmas, self._network.pose_noise, found.pixel, found.sigma_px
-        shared = found.shared(0.0, TOGETHER_S, STILL_SIGNIFICANT if noise.vibration else SIGNIFICANT)
-        self._shared = max(shared, SHARE_KEPT * self._shared)
+        share, deviation = found.in_common(0.0, TOGETHER_S)
+        significant = share > (STILL_SIGNIFICANT if noise.vibration else SIGNIFICANT) * deviation
+        self._shared = max(share if significant else 0.0, SHARE_KEPT * self._shared)
+        self._of_the_image |= share + SURELY * deviation < VIBRATES
         total = (sigma * sigmas.image) ** 2 + (noise.vibration / pixel) ** 2
         wanted = total * min(max(found.ratio, MOST_DOWN**2), MOST_UP**2)
         return self.state(wanted, pixel, sigma)
@@ -138,11 +144,15 @@ class NoiseOfLooks:
         before = np.array([sigmas.image, noise.vibration / pixel / sigma_px])
         now = np.array([image, vibration / pixel / sigma_px])
         little = np.abs(now - before).max() < (CHANGED - 1.0) * np.hypot(*before)
-        if (now == before).all() or (little and now.max() > 1.0):
-            return False
-        sigmas.image, noise.vibration = image, vibration
-        sigmas.version += 1
-        return True
+        as_before = bool((now == before).all() or (little and now.max() > 1.0))
+        if not as_before:
+            sigmas.image, noise.vibration = image, vibration
+            sigmas.version += 1
+        self._of_the_image &= sigmas.image > 1.0  # else there is nothing unstated, or it is known to be a vibration
+        doubtful = sigmas.image > MAY_VIBRATE and not self._of_the_image
+        unstated = pixel * sigma_px * float(np.sqrt(sigmas.image**2 - 1.0))
+        noise.possible_vibration = unstated if doubtful else noise.vibration
+        return not as_before
 
 
 @dataclass(frozen=True)
@@ -170,17 +180,15 @@ class Residuals:
 
     def last(self) -> bool:
         """Whether what looks have in common lasts longer than a vibration: then it is a wander of the trajectory."""
-        return self.shared(*APART_S, SIGNIFICANT) > LASTING
+        share, deviation = self.in_common(*APART_S)
+        return share > max(LASTING, SIGNIFICANT * deviation)
 
-    def shared(self, least_s: float, most_s: float, significant: float) -> float:
-        """Share of the variance that looks at different points have in common which are so far apart in time.
+    def in_common(self, least_s: float, most_s: float) -> tuple[float, float]:
+        """Share of the variance that looks at different points have in common which are so far apart in time, and its
+        standard deviation where they have nothing in common; 0 and infinity from too few looks.
 
         Of two residuals with redundancy numbers r1, r2 and a noise of variance A in common, the product has the
         expectation ``r1 r2 A``: the rest of the noise is taken by the points.
-
-        Parameters
-        ----------
-        significant : in units of its standard deviation, where nothing is in common; 0 is returned below
         """
         a = np.arange(len(self.time_s))
         b = np.maximum(np.searchsorted(self.time_s, self.time_s + least_s), a + 1)
@@ -188,11 +196,12 @@ class Residuals:
         near = (self.time_s[b] - self.time_s[a] < most_s) & (self.point[a] != self.point[b])
         a, b = a[near], b[near]
         if len(a) < LEAST_PAIRS:
-            return 0.0
+            return 0.0, np.inf
         w, r = self.w, self.redundancy[a] * self.redundancy[b]
+        square = float(np.sum(r**2))
         found, noise = float(np.sum(w[a] * w[b] * r**1.5)), float(np.sqrt(np.sum(r**3)))
         total = float(np.sum(w**2 * self.redundancy) / np.sum(self.redundancy))
-        return min(found / float(np.sum(r**2)) / total, 1.0) if found > significant * noise * total else 0.0
+        return min(found / square / total, 1.0), noise / square
 
 
 def _median_ratio(w: Array) -> float:

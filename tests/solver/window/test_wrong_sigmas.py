@@ -40,6 +40,7 @@ from triline.solver.window.screening.likelihood import (
     LookNoise,
     likely,
 )
+from triline.solver.window.screening.look_noise import MAY_VIBRATE
 from triline.solver.window.screening.sigma_check import MEMORY_S, SigmaCheck
 from triline.solver.window.state.network import LiveNetwork
 from triline.solver.window.state.sigma_factors import changed
@@ -209,6 +210,23 @@ def test_a_vibration_that_is_found_late_was_there_from_the_start():
     simulation, online = vibrating(0.03, 3)
     nees = attitude_nees(simulation, online)
     assert ((nees > 0.4) & (nees < 1.6)).all(), nees
+
+
+def test_noise_that_may_be_a_vibration_is_in_the_sigmas_of_the_attitude():
+    """Looks are ten times as noisy as stated, and too few to tell why: NEES of the attitude was 10, 10 and 9."""
+    simulation, online = vibrating(0.02, 3)
+    assert not any("vibrates" in event for event in online.events)
+    nees = attitude_nees(simulation, online)
+    assert ((nees > 0.3) & (nees < 1.6)).all(), nees
+
+
+def test_noise_of_the_image_is_no_vibration_of_the_attitude():
+    simulation = simulate(replace(PLAN, strip_s=30.0), 3, RTK, OBSERVED, world=World(noise_factor=5.0))
+    online = adjust_online(simulation, navigate(simulation), OPTIONS, live=False, update_s=1.0)
+    network = online.window.network
+    assert network.sigmas.image > MAY_VIBRATE and network.pose_noise.possible_vibration == 0.0
+    nees = attitude_nees(simulation, online)
+    assert ((nees > 0.3) & (nees < 2.5)).all(), nees
 
 
 @pytest.mark.study
