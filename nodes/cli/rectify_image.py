@@ -42,6 +42,9 @@ Array = NDArray[np.floating]
 
 #: Sigma of heights and places of control, m, where ``--height-sigma`` states none: a hand-held receiver.
 GROUND_SIGMA_M = 15.0
+#: A correction by control that moves pixels by more than this share of their distance is told. Tuned: no metadata of an
+#: image are as wrong, a heading off by five degrees is told not yet.
+LARGE_TURN = 0.1
 #: Sigma of line and sample of control, px, where ``--pixel-sigma`` states none.
 CONTROL_SIGMA_PX = 0.5
 _CONTROL = (
@@ -278,6 +281,11 @@ def _sensor(args: argparse.Namespace, image: SourceImage) -> _Sensor:
     fit = None
     if args.control is not None and args.correction == "camera":
         found = _camera_by_control(args, Path(args.control), model, image, sigmas)
+        if args.height_sigma is None:
+            notes.append(
+                f"control: its points are taken to be good to {GROUND_SIGMA_M:g} m in place and height; --height-sigma "
+                "says better"
+            )
         out = found.found.rejected
         if 2 * out.sum() > len(out):
             notes.append(
@@ -295,6 +303,12 @@ def _sensor(args: argparse.Namespace, image: SourceImage) -> _Sensor:
         model = CorrectedModel(model, fit.bias)
         if fit.rejected.any():
             notes.append(f"{args.control}: {int(fit.rejected.sum())} points rejected by data snooping")
+        turned = float(np.linalg.norm(fit.bias.turn - np.eye(2), 2))
+        if turned > LARGE_TURN:
+            notes.append(
+                f"{args.control}: turns or stretches the image by {100.0 * turned:.0f} % of its size, which metadata "
+                "hardly want: are columns and rows those of the image as it is?"
+            )
     return _Sensor(model, bare, kind, (line, sample), sigmas, fit, ellipsoid, notes)
 
 
@@ -661,8 +675,9 @@ def _tell(
     print(f"  {cells['value']} cells with a value" + (", " + ", ".join(missing) if missing else ""))
     if fit is not None:
         line, sample = result["control"]["shift_px"]
+        sigma0 = f"sigma0 {fit.sigma0:.2f}" if fit.redundancy else "no redundancy"
         print(
-            f"  control: {len(fit.rejected)} points, {int(fit.rejected.sum())} rejected, sigma0 {fit.sigma0:.2f}, "
+            f"  control: {len(fit.rejected)} points, {int(fit.rejected.sum())} rejected, {sigma0}, "
             f"shift of lines {line:+.2f} px, of samples {sample:+.2f} px"
         )
     if sensor.camera is not None:

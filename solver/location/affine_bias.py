@@ -71,11 +71,15 @@ class AffineBias:
     def _terms(self, pixel: Array) -> Array:
         return np.concatenate([np.ones((len(pixel), 1)), (pixel - self.middle) / self.half], axis=1)
 
+    @property
+    def turn(self) -> Array:
+        """(2, 2) from differences of the model's lines and samples to corrected ones; the identity for a shift."""
+        return np.eye(2) + self.coefficients[:, 1:] / self.half
+
     def without(self, pixel: Array) -> Array:
         """The model's lines and samples (n, 2) of corrected ones (n, 2)."""
-        A = np.eye(2) + self.coefficients[:, 1:] / self.half
         shift = self.coefficients[:, 0] - self.coefficients[:, 1:] @ (self.middle / self.half)
-        return np.linalg.solve(A, (pixel - shift).T).T
+        return np.linalg.solve(self.turn, (pixel - shift).T).T
 
 
 @dataclass(frozen=True)
@@ -171,7 +175,7 @@ def fit_bias(
     Raises
     ------
     ValueError : fewer points than coefficients want, or points that the model does not see; points on a line, which
-        determine no affine correction
+        determine no affine correction; points that see the image as in a mirror
     """
     lat, lon, h, u, v = (np.array(np.broadcast_to(a, np.shape(lat)), dtype=float).ravel()
                          for a in (lat, lon, height_m, line, sample))  # fmt: skip
@@ -221,6 +225,9 @@ def fit_bias(
     coefficients[keep], full[np.ix_(keep, keep)] = x, Q
     sigma0 = float(np.sqrt(square / redundancy)) if redundancy else float("nan")
     bias = AffineBias(coefficients.reshape(2, 3), full, middle, half)
+    if np.linalg.det(bias.turn) <= 0.0:
+        mirror = "its points see the image as in a mirror"
+        raise ValueError(f"{mirror}: wanted rows counted from above, columns from the left")
     return BiasFit(bias, residual, w, ~used, sigma0, redundancy)
 
 

@@ -572,12 +572,13 @@ def aerial_photograph(folder, off_m, sigma_up_m):
     return camera, table
 
 
-def rectify_photograph(folder, table):
+def rectify_photograph(folder, table, height_sigma=0.001):
     control = folder / "control.csv"
     rows = zip(*(np.asarray(a).tolist() for a in table.values()), strict=True)
     control.write_text(",".join(table) + "\n" + "\n".join(",".join(map(repr, row)) for row in rows))
     args = ["rectify", folder / "photo.tif", "--sensor", folder / "photo.json", "--height", 900, "--control", control]
-    args += ["--correction", "camera", "--pixel-sigma", 0.1, "--height-sigma", 0.001, "-o", folder / "o.tif", "--json"]
+    args += ["--correction", "camera", "--pixel-sigma", 0.1, "-o", folder / "o.tif", "--json"]
+    args += [] if height_sigma is None else ["--height-sigma", height_sigma]
     return main([str(a) for a in args])
 
 
@@ -591,7 +592,11 @@ def test_control_finds_the_height_of_a_photograph(tmp_path, capsys):
     up, f = found["parameters"]["h"], found["parameters"]["f"]
     assert up["unit"] == "m" and f["unit"] == "mm" and up["sigma"] < 5.0
     assert abs(up["change"] + 15.0) < 3.5 * up["sigma"] and abs(f["change"]) < 3.5 * f["sigma"]
-    assert not [note for note in result["notes"] if "let expect" in note]
+    assert not [note for note in result["notes"] if "let expect" in note or "taken to be good" in note]
+    # nobody says how good the control is: it corrected next to nothing, and no word said why
+    assert rectify_photograph(tmp_path / "p", table, None) == 0
+    notes = json.loads(capsys.readouterr().out)["notes"]
+    assert "control: its points are taken to be good to 15 m in place and height; --height-sigma says better" in notes
     # known to half a metre it is not 15 m off: something else is wrong, and is named
     _, table = aerial_photograph(tmp_path / "q", 15.0, 0.5)
     assert rectify_photograph(tmp_path / "q", table) == 0
@@ -812,6 +817,35 @@ def test_control_takes_a_shift_and_a_turn_out(scene, tmp_path, capsys):
     lon, lat = np.radians(Transformer.from_crs(out.crs, "EPSG:4326", always_xy=True).transform(x, y))
     a, b = model.inverse([lat], [lon], relief.at([lat], [lon]), 0.0)[0]
     assert values[:, row, column] - 10.0 == pytest.approx([a + 7.0 + 0.002 * b, b - 4.0 - 0.003 * a], abs=0.01)
+
+
+def test_control_of_a_mirrored_image_is_refused_and_a_large_turn_told(scene, tmp_path, capsys):
+    """Rows counted from below: the affine correction mirrored the image, with sigma0 0 and no word."""
+    _, path, model, *_, image = scene
+    rng = np.random.default_rng(4)
+    u, v = rng.uniform(20, 280, (2, 3))
+    places = model.direct(u, v, np.full(3, 300.0)) * np.degrees([1.0, 1.0, np.radians(1.0)])
+    control, out = tmp_path / "control.csv", tmp_path / "o.tif"
+    args = [image, "--sensor", path, "--height", 300, "--control", control, "-o", out]
+
+    def measured(row, column):
+        rows = [f"{lon!r},{lat!r},{h!r},{x!r},{y!r}" for (lat, lon, h), x, y in
+                zip(places.tolist(), column.tolist(), row.tolist(), strict=True)]  # fmt: skip
+        control.write_text("\n".join(["lon_deg,lat_deg,height_m,column,row", *rows, ""]))
+
+    for row, column in ((model.lines - 1 - u, v), (v, u)):  # counted from below, and the one for the other
+        measured(row, column)
+        said = refused(capsys, *args)
+        assert "control.csv: its points see the image as in a mirror: wanted rows counted from above" in said
+        assert not out.exists()
+    measured(model.lines - 1 - u, model.samples - 1 - v)
+    assert main(["rectify", *map(str, args)]) == 0
+    said = capsys.readouterr().out
+    assert "control: 3 points, 0 rejected, no redundancy, shift of lines" in said
+    assert "control.csv: turns or stretches the image by 200 % of its size" in said
+    measured(u, v)
+    assert main(["rectify", *map(str, args)]) == 0
+    assert "turns or stretches" not in capsys.readouterr().out
 
 
 def test_sigmas_of_a_correction_are_as_good_as_its_control(scene, tmp_path, capsys):
