@@ -291,7 +291,7 @@ def lines_of_recording(recording: Recording, name: str | None) -> tuple[str, Ite
                 continue
             position, R = own.at(time_s[known])
             covariance = np.full((len(known), 6, 6), np.nan)
-            if name in REFINED and own.has_covariance:
+            if name != "truth" and own.has_covariance:
                 covariance = own.covariance_at(time_s[known])
             yield OrientedLines(strip.id, known, stamps[known], position, R, covariance)
 

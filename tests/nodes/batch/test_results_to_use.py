@@ -295,6 +295,18 @@ def test_lines_as_sbet_are_those_of_the_csv(oriented, tmp_path, capsys):
     np.testing.assert_allclose(np.degrees(again.sigma_rpy[:, 2]), lines.sigma_kappa_deg, rtol=0.05)
 
 
+def test_lines_by_measured_poses_have_the_sigmas_of_these(oriented, tmp_path):
+    """They had none, and `--format smrmsg` said that no pose has a covariance."""
+    recording, _ = oriented
+    out, accuracies = tmp_path / "lines.csv", tmp_path / "lines.smrmsg"
+    for name, words in ((out, []), (accuracies, ["--format", "smrmsg"])):
+        assert main(["export", str(recording), "--per-line", str(name), "--orientation", "measured", *words, "-q"]) == 0
+    lines, poses = pd.read_csv(out), Recording(recording).poses("trajectory/smoothed")
+    up = np.interp(lines.time_s, poses.time_ns * 1e-9, np.sqrt(poses.covariance[:, 2, 2]))
+    np.testing.assert_allclose(lines.sigma_Z_m, up, atol=1e-3)
+    np.testing.assert_allclose(np.fromfile(accuracies, "<f8").reshape(-1, 10)[:, 3], lines.sigma_Z_m, atol=1e-4)
+
+
 def test_formats_of_lines_are_refused_in_one_line(oriented, block, tmp_path, capsys):
     recording, _ = oriented
     folder, _ = block
