@@ -13,6 +13,7 @@ import numpy as np
 from ...solver.camera.line_camera import LineCamera
 from ...solver.geometry.measured_trajectory import POSE_GAP_S
 from ...solver.navigation.inertial_data import InertialGrade
+from ...solver.orthoimage.orientation import SAME_S
 from ..convert import SECOND_NS, camera_message, state_noise
 from ..errors import UserError
 from ..node import Message
@@ -379,7 +380,8 @@ def within(strip: ImageStrip, begin_ns: int, end_ns: int, what: str) -> ImageStr
         raise UserError(
             f"strip {strip.id}: lines from {spans[0]}, but {what} from {spans[1]}; wanted the same time scale{day}"
         )
-    out = int(np.count_nonzero((strip.time_ns < begin_ns) | (strip.time_ns > end_ns)))
+    rounded_ns = round(SAME_S * SECOND_NS)
+    out = int(np.count_nonzero((strip.time_ns < begin_ns - rounded_ns) | (strip.time_ns > end_ns + rounded_ns)))
     if not out:
         return strip
     note = f"strip {strip.id}: {out} of {len(strip.time_ns)} lines outside the time of the {what}: without orientation"

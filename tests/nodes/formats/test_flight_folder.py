@@ -15,6 +15,7 @@ from triline.nodes.cli import main
 from triline.nodes.config import load
 from triline.nodes.convert import local_frame, pose_sample
 from triline.nodes.formats.block_folder import read_ground_points
+from triline.nodes.formats.detect import within
 from triline.nodes.formats.flight_folder import read_flight
 from triline.nodes.formats.geotiff import Heights, write_heights
 from triline.nodes.formats.table import read_table
@@ -279,6 +280,15 @@ def test_lines_and_sensors_of_different_times_are_told(folder, tmp_path, capsys)
     (at / "gnss.csv").unlink()
     (problem,) = (p for p in read_flight(folder).problems if "gnss.csv" in p)
     assert problem.endswith("gnss.csv: no such file, wanted GNSS positions")
+
+
+def test_no_line_is_outside_of_poses_for_the_rounding_of_their_times(folder):
+    """Of poses of each line, which another program wrote, the last one was a nanosecond too early."""
+    strip = read_flight(folder).strips[0]
+    first, last = int(strip.time_ns[0]), int(strip.time_ns[-1])
+    assert within(strip, first + 900, last - 900, "poses").notes == strip.notes
+    (note,) = within(strip, first, last - 2000, "poses").notes[len(strip.notes) :]
+    assert "1 of 50 lines outside the time of the poses" in note
 
 
 def test_a_vertical_datum_without_a_geoid_is_refused(folder):
