@@ -25,7 +25,7 @@ from ...solver.rectification.sampled import some_cells
 from ..errors import UserError
 from ..formats.geotiff import BLOCK, SIGMA_BANDS, Raster, tiled_orthoimage
 from ..formats.height_raster import HeightRaster, RasterFile
-from ..formats.raster_open import check_grey_values
+from ..formats.raster_open import check_grey_values, open_raster
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -108,7 +108,8 @@ class SourceImage:
             self._unstated = True
             if self.nodata is None:
                 self.nodata = float("nan") if self.dtype.kind == "f" else 0.0
-        self.descriptions = tuple(text or "" for text in source.descriptions)
+        with open_raster(path) as whole:  # without its overviews GDAL does not tell the names of the bands
+            self.descriptions = tuple(text or "" for text in whole.descriptions)
         self.scales, self.offsets = tuple(source.scales), tuple(source.offsets)
         self.units = tuple(unit or "" for unit in source.units)
         self.colors = tuple(source.colorinterp)

@@ -280,8 +280,10 @@ def test_what_grey_values_mean_goes_on(scene, tmp_path, more):
     image = write_image(tmp_path / "reflectance.tif", np.full((2, TRUTH.lines, TRUTH.samples), 4000, dtype=np.uint16))
     with rasterio.open(image, "r+") as target:
         target.scales, target.offsets, target.units = (1e-4, 2e-4), (-0.1, 0.0), ("reflectance", "1")
+        target.set_band_description(2, "NIR")
     out = rectify(tmp_path, image, path, "--height", 100, *more)
     assert out.scales == (1e-4, 2e-4) and out.offsets == (-0.1, 0.0) and out.units == ("reflectance", "1")
+    assert out.descriptions == (None, "NIR")  # they were lost
     assert set(np.unique(out.read())) == {0, 4000}
 
 
