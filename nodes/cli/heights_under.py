@@ -21,6 +21,8 @@ MOST_ROUNDS = 10
 BELOW_CAMERA_M = 2.0
 #: Rasters that are looked for in a folder of heights.
 _NAMES = (".hgt", ".tif", ".tiff", ".bil", ".img", ".dt1", ".dt2", ".vrt")
+#: Note on sigmas of an orthoimage whose heights nobody has said anything about.
+NO_HEIGHT_SIGMA = "sigma: the heights of the ground are taken as without error; --height-sigma states theirs"
 
 
 def rasters_of_heights(names: Iterable[str]) -> list[Path]:

@@ -32,7 +32,7 @@ from ..formats.json_text import json_text
 from ..formats.new_file import refuse_unless_writable
 from ..formats.projection import notes_of_map, unit_of
 from ..formats.table import Column, read_table
-from .heights_under import below_camera, height_range, rasters_of_heights
+from .heights_under import NO_HEIGHT_SIGMA, below_camera, height_range, rasters_of_heights
 from .locate import with_refraction
 from .location_model import SENSORS, read_location_model
 from .outputs import refuse_over_files
@@ -562,6 +562,8 @@ def _error_map(args: argparse.Namespace, sensor: _Sensor) -> ErrorMap | None:
     attitude = stated.attitude_rad if args.attitude_sigma is None else tuple(np.radians(args.attitude_sigma).tolist())
     pixel = stated.pixel if args.pixel_sigma is None else (args.pixel_sigma, args.pixel_sigma)
     height = stated.height_m if args.height_sigma is None else args.height_sigma
+    if not height and args.height_sigma is None and not args.mosaic:
+        sensor.notes.append(NO_HEIGHT_SIGMA)
     bare, fit = sensor.bare, sensor.fit
     oriented = any((*position, *attitude))
     rpc_m2 = 0.0

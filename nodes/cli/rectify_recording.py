@@ -37,6 +37,7 @@ from ..errors import UserError
 from ..formats.camera_json import read_camera_instead
 from ..formats.dem import dem_in_frame
 from ..recording.access import Recording
+from .heights_under import NO_HEIGHT_SIGMA
 from .locate import refraction_of
 
 #: An orthoimage with more cells than this is refused: the mosaic is put together in memory.
@@ -124,6 +125,8 @@ def prepared(args: argparse.Namespace, path: Path) -> Prepared:
         surface = UnderAir(surface, frame, refraction_of(args.refraction, WGS84, str(path)))
         ground += ", refraction taken off"
     errors = _errors(args, path, camera, ccd, name, orientation)
+    if errors is not None and args.height_sigma is None and not args.mosaic:
+        notes.append(NO_HEIGHT_SIGMA)
     above = float(np.median(orientation.measured.position_l[:, 2])) - ground_m
     if above <= 0:
         raise UserError(f"{path}: the camera is {-above:.0f} m below the ground; wanted another --height or --dem")

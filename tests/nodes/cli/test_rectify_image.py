@@ -877,6 +877,8 @@ def test_sigmas_of_a_correction_are_as_good_as_its_control(scene, tmp_path, caps
     assert means[3.0] / means[0.1] == pytest.approx(30.0, rel=0.02)
     stated, notes = sigma_with(0.1, "--pixel-sigma", "0.5")
     assert not any("as good as it fits" in note for note in notes)
+    without = "sigma: the heights of the ground are taken as without error; --height-sigma states theirs"
+    assert without in notes and without not in sigma_with(0.1, "--height-sigma", "0.5")[1]
     assert stated > 4.0 * means[0.1]
     # four points have two observations too many, which fit by chance
     few, notes = sigma_with(0.1, points=4)

@@ -356,6 +356,7 @@ def test_sigmas_beside_the_orthoimage(flown, simulated, dem, folder, capsys):
         result = _rectify(
             capsys, flown, folder / "o.tif", "--orientation", name, "--dem", dem, "--gsd", 8, "--sigma", sigma, *options
         )
+        assert any("heights of the ground are taken as without error" in n for n in result["notes"]) != bool(options)
         with rasterio.open(sigma) as image, rasterio.open(folder / "o.tif") as grey:
             assert image.shape == grey.shape == (result["rows"], result["columns"]) and image.crs == grey.crs
             assert image.transform == grey.transform and np.isnan(image.nodata) and image.count == 2
