@@ -40,8 +40,6 @@ QUIET_S, LONG_QUIET_S = 4.0, 15.0
 IN_STRIPS = ("sensor/lines/", "orientation/", "orthoimage/")
 #: What was said before is of the flight that is under way if its stamp is not later by more, ns.
 SAME_FLIGHT_NS = 5_000_000_000
-#: Between the last message and the end of the session, for what is still on its way.
-LAST_WORDS_S = 0.2
 
 
 class _Patience:
@@ -210,7 +208,6 @@ class BusRunner:
             self._publish(output)
         self._tell(force=True, state=STOPPING)
         self._inbox.close()
-        time.sleep(LAST_WORDS_S)
 
     # ---- one message
 

@@ -51,6 +51,9 @@ Answer = Callable[[dict[str, str]], Any]
 Recipe = Callable[[Any, int], Any]
 #: For so long a session stays open beside the one that takes its place, s.
 BOTH_S = 1.0
+#: What every session answers when it has taken off the wire what the one that asks had said before; and for so long one
+#: that is about to end waits for these answers, s. A frozen program gives none.
+TAKEN, TAKEN_S = "taken", 5.0
 #: A program that ends waits for so long for a session that is still being closed, s.
 CLOSED_S = 5.0
 #: What a router answers, of any platform, to who wants to know whether his link carries anything.
@@ -209,6 +212,7 @@ class Bus:
         #: Why this session was opened anew, the newest last.
         self.opened_anew: list[str] = []
         self._declare(self._hear_of_others)
+        self._declare(self._tell_taken)
         threading.Thread(target=self._watch_links, name="links", daemon=True).start()
 
     def __enter__(self) -> Bus:
@@ -520,7 +524,15 @@ class Bus:
         return ""
 
     def close(self) -> None:
-        """Withdraw everything and close the session; callbacks have ended when this returns."""
+        """Withdraw everything and close the session; callbacks have ended when this returns.
+
+        What was published before has been taken by all who listen: a connection that is closed while something has come
+        over it that nobody has read yet is cut, and what the other end has not read is lost.
+        """
+        if self._publishers:
+            with contextlib.suppress(zenoh.ZError):
+                for _ in self._session.get(self.key(f"query/{TAKEN}"), target=zenoh.QueryTarget.ALL, timeout=TAKEN_S):
+                    pass
         self._ended.set()
         with self._opening:
             pass  # a session that is being opened anew is closed here, too
@@ -564,6 +576,12 @@ class Bus:
                 return
 
         return session.declare_subscriber(self.key("status/*"), zenoh.handlers.Callback(take, indirect=False))
+
+    def _tell_taken(self, session: Any, _: int) -> Any:
+        """Answer, without a word, in the thread that takes messages off the wire: after those that came before."""
+
+        handler = zenoh.handlers.Callback(lambda query: query.drop(), indirect=False)
+        return session.declare_queryable(self.key(f"query/{TAKEN}"), handler)
 
     def _watch_links(self) -> None:
         while not self._ended.wait(BEAT_S):

@@ -396,3 +396,39 @@ def test_a_platform_hears_only_itself():
     assert got == ["one"]
     with pytest.raises(UserError, match="wanted a name without"):
         Bus("a/b", port=port)
+
+
+def test_who_ends_waits_until_all_has_been_taken_that_was_said():
+    """The last results of an adjuster were lost where a recorder was busy for a moment and said something meanwhile."""
+    port, heard, spoken = free_port(), [], threading.Event()
+
+    def take(raw: RawMessage) -> None:
+        heard.append(raw.envelope.sequence)
+        if len(heard) == 20:
+            time.sleep(0.5)
+
+    def raw(topic: str, bus: Bus, number: int) -> RawMessage:
+        return RawMessage(topic, Envelope(number, bus.source, number, bus.start), bytes(500))
+
+    with Bus(port=port, source="recorder") as recorder:
+        recorder.subscribe("orientation/whole", take)
+
+        def talk() -> None:
+            for number in range(2000):
+                recorder.publish_raw(raw("status/recorder", recorder, number))
+                if spoken.wait(0.01):
+                    return
+
+        talking = threading.Thread(target=talk)
+        with Bus(port=port, source="adjuster") as adjuster:
+            adjuster.prepare(["orientation/whole"])
+            adjuster.subscribe("status/recorder", lambda raw: None)
+            wait_for(lambda: adjuster.peers() == 1, 10, "the recorder")
+            talking.start()
+            time.sleep(0.5)
+            for number in range(400):
+                adjuster.publish_raw(raw("orientation/whole", adjuster, number))
+        found = len(heard)
+        spoken.set()
+        talking.join()
+    assert found == 400
