@@ -130,8 +130,13 @@ class LineCameraSettings:
         return out
 
     def check_camera(self, keys: Keys, camera: LineCamera) -> None:
-        """Raise UserError where the CCD lines are not those of the camera, or have another number of pixels."""
+        """Raise UserError where the CCD lines are not those of the camera, or have another number of pixels, or where
+        nothing says how many."""
         lines = {line.id: line.pixels for line in camera.lines}
+        bare = [path.name for path, _ in self.images.values() if path.is_file() and header_of(path) is None]
+        if not self.samples and (bare or not self.images):
+            what = f"no ENVI header beside {bare[0]} says" if bare else "no name of a block says"
+            raise UserError(f"{keys.path}: {keys.name('samples')}: missing; {what} how many pixels a line has")
         for ccd in self.images:
             if ccd not in lines:
                 raise UserError(f"{keys.path}: {keys.name('images')}: CCD line {ccd!r}, wanted {', '.join(lines)}")

@@ -254,6 +254,26 @@ def test_the_camera_must_have_the_lines(tmp_path):
             given.check_camera(keys, camera)
 
 
+def test_a_raw_file_whose_lines_have_no_length_is_told_before_the_flight(tmp_path):
+    """`check` said that the folder is complete, and the sensor ended in flight."""
+    write_camera(tmp_path / "camera.json")
+    camera = read_camera(tmp_path / "camera.json", [])
+    images = {"N": "n.raw"}
+    given = settings(tmp_path, images=images, first_time=START, samples=0)
+    keys = Keys(tmp_path / "flight.toml", {"images": images}, "sensor[0]")
+    given.check_camera(keys, camera)  # the file is not there yet, nor is its header
+    (tmp_path / "n.raw").write_bytes(b"")
+    with pytest.raises(
+        UserError, match=r"sensor\[0\].samples: missing; no ENVI header beside n.raw says how many pixels"
+    ):
+        given.check_camera(keys, camera)
+    (tmp_path / "n.hdr").write_text("ENVI")
+    given.check_camera(keys, camera)
+    blocks = settings(tmp_path, folder="blocks", samples=0)
+    with pytest.raises(UserError, match=r"sensor\[0\].samples: missing; no name of a block says how many pixels"):
+        blocks.check_camera(Keys(tmp_path / "flight.toml", {"folder": "blocks"}, "sensor[0]"), camera)
+
+
 @pytest.mark.parametrize(
     ("keys", "wanted"),
     [
