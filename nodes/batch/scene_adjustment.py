@@ -17,11 +17,13 @@ from ...solver.adjustment.reliability import CRITICAL_W, reliability
 from ...solver.adjustment.statistics import GlobalTest, global_test, mean_sigma, point_accuracy, strongest_correlations
 from ...solver.adjustment.variance_components import LEAST_REDUNDANCY
 from ...solver.camera.self_calibration import SELF_CALIBRATIONS, unit_of
+from ...solver.location.affine_bias import LARGE_TURN
 from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.location.rpc_fit import fit_to_model
 from ...solver.models import MODELS
 from ...solver.models.base import Extent, ModelOptions
 from ...solver.orbit.time_scales import iso_utc
+from ...solver.scene_adjustment.functional import RpcImage
 from ...solver.scene_adjustment.images import CAMERA, IMAGE, ORIENTATION, ImageModel
 from ...solver.scene_adjustment.rigorous import CorrectionSet, RigorousImage, calibration_of, flight_axes_b
 from ...solver.scene_adjustment.single_looks import SingleLooks, single_looks
@@ -544,6 +546,7 @@ def _notes(a: SceneAdjustment) -> list[str]:
     if a.snooping is not None and a.snooping.given_up:
         share = 100 * a.snooping.given_up
         notes.append(f"data snooping given up: {share:.0f} % of the image points would go; model or sigmas are wrong")
+    notes += _turned_notes(a)
     notes += _control_notes(a)
     notes += _single_look_note(a)
     if a.before is not None and not a.before[1].converged:
@@ -563,6 +566,18 @@ def _notes(a: SceneAdjustment) -> list[str]:
     if _rigorous(a):
         notes.append("corrections: X along the track, Y across it to the right, Z up; omega about forward, phi about "
                      "right, kappa about down")  # fmt: skip
+    return notes
+
+
+def _turned_notes(a: SceneAdjustment) -> list[str]:
+    """Images whose polynomials no orbit and no attitude can be as wrong for as their correction says."""
+    notes = []
+    for k, image in enumerate(a.problem.block.images):
+        if isinstance(image, RpcImage) and (turned := image.located(a.values_of(k)).bias.turned) > LARGE_TURN:
+            notes.append(
+                f"image {image.name}: its correction turns or stretches it by {100.0 * turned:.0f} % of its size: are "
+                "lines and samples those of the image as it is, from above and from the left?"
+            )
     return notes
 
 

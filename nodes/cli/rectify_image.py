@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...solver.adjustment.reliability import CRITICAL_W
 from ...solver.adjustment.variance_components import LEAST_REDUNDANCY
 from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
-from ...solver.location.affine_bias import BiasFit, CorrectedModel, fit_bias
+from ...solver.location.affine_bias import LARGE_TURN, BiasFit, CorrectedModel, fit_bias
 from ...solver.location.cropped import CroppedModel
 from ...solver.location.frame_camera import FrameCamera
 from ...solver.location.pushbroom import PushbroomSensor
@@ -42,9 +42,6 @@ Array = NDArray[np.floating]
 
 #: Sigma of heights and places of control, m, where ``--height-sigma`` states none: a hand-held receiver.
 GROUND_SIGMA_M = 15.0
-#: A correction by control that moves pixels by more than this share of their distance is told. Tuned: no metadata of an
-#: image are as wrong, a heading off by five degrees is told not yet.
-LARGE_TURN = 0.1
 #: Sigma of line and sample of control, px, where ``--pixel-sigma`` states none.
 CONTROL_SIGMA_PX = 0.5
 _CONTROL = (
@@ -303,11 +300,10 @@ def _sensor(args: argparse.Namespace, image: SourceImage) -> _Sensor:
         model = CorrectedModel(model, fit.bias)
         if fit.rejected.any():
             notes.append(f"{args.control}: {int(fit.rejected.sum())} points rejected by data snooping")
-        turned = float(np.linalg.norm(fit.bias.turn - np.eye(2), 2))
-        if turned > LARGE_TURN:
+        if fit.bias.turned > LARGE_TURN:
             notes.append(
-                f"{args.control}: turns or stretches the image by {100.0 * turned:.0f} % of its size, which metadata "
-                "hardly want: are columns and rows those of the image as it is?"
+                f"{args.control}: turns or stretches the image by {100.0 * fit.bias.turned:.0f} % of its size, which "
+                "metadata hardly want: are columns and rows those of the image as it is?"
             )
     return _Sensor(model, bare, kind, (line, sample), sigmas, fit, ellipsoid, notes)
 

@@ -22,6 +22,9 @@ _STEP_M = 1.0
 #: Points nearer to a line than this, pixels and as a share of its length, do not tell what is beside it. Derived: a
 #: tenth of a pixel of theirs would be many pixels across the image.
 _NARROW_PX, _NARROW = 1.0, 1e-3
+#: A correction that moves pixels by more than this share of their distance is told. Tuned: no metadata of an
+#: image are as wrong, a heading off by five degrees is told not yet.
+LARGE_TURN = 0.1
 #: Two-sided level of the test of one point, the usual one of data snooping.
 SNOOPING_LEVEL = 0.001
 
@@ -75,6 +78,11 @@ class AffineBias:
     def turn(self) -> Array:
         """(2, 2) from differences of the model's lines and samples to corrected ones; the identity for a shift."""
         return np.eye(2) + self.coefficients[:, 1:] / self.half
+
+    @property
+    def turned(self) -> float:
+        """By which share of their distance two pixels are moved against each other at most."""
+        return float(np.linalg.norm(self.turn - np.eye(2), 2))
 
     def without(self, pixel: Array) -> Array:
         """The model's lines and samples (n, 2) of corrected ones (n, 2)."""

@@ -331,6 +331,26 @@ def test_metadata_of_another_scene_are_refused_unless_they_are_said_to_be_that_b
     assert main(["adjust", str(tmp_path / "pair"), "--snoop", "-q"]) == 0
 
 
+def test_an_image_that_its_points_show_upside_down_is_told(made, tmp_path, capsys):
+    """Lines counted from below: the affine correction of its polynomials mirrored the image, and no word said so."""
+    block = tmp_path / "rpc"
+    block.mkdir()
+    sensor = read_scene(made / "spot5-hrs").sensors["F"]
+    write_rpb(block / "F.RPB", fit_to_model(sensor, -500.0, 2500.0).rpc)
+    scenes = f'[scenes.F]\nmetadata = "F.RPB"\n[scenes.B]\nmetadata = "{made}/spot5-hrs"\n'
+    (block / "project.toml").write_text(f'[project]\ncrs = "EPSG:4979"\n{scenes}')
+    shutil.copy(made / "ground_points.csv", block)
+    image = pd.read_csv(made / "image_points.csv")
+    image = image.assign(strip=image["ccd"], ccd=image["ccd"].where(image["ccd"] == "B", ""))
+    told = "note: image F: its correction turns or stretches it by 200 % of its size"
+    for turned in (False, True):
+        if turned:
+            image["line"] = image["line"].where(image["strip"] == "B", sensor.lines - 1 - image["line"])
+        image.to_csv(block / "image_points.csv", index=False)
+        assert main(["adjust", str(block), "-q"]) == 0
+        assert (told in capsys.readouterr().out) == turned
+
+
 def test_one_swapped_control_point_of_polynomials_is_refused(made, tmp_path, capsys):
     """One of nine: nothing was left of the block but one point, "sigma0 1.0000, passed, NOT CONVERGED"."""
     block = tmp_path / "rpc"
