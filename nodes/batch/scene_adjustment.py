@@ -547,6 +547,7 @@ def _notes(a: SceneAdjustment) -> list[str]:
         share = 100 * a.snooping.given_up
         notes.append(f"data snooping given up: {share:.0f} % of the image points would go; model or sigmas are wrong")
     notes += _turned_notes(a)
+    notes += _without_control_notes(a)
     notes += _control_notes(a)
     notes += _single_look_note(a)
     if a.before is not None and not a.before[1].converged:
@@ -579,6 +580,19 @@ def _turned_notes(a: SceneAdjustment) -> list[str]:
                 "lines and samples those of the image as it is, from above and from the left?"
             )
     return notes
+
+
+def _without_control_notes(a: SceneAdjustment) -> list[str]:
+    """Images all of whose pixels of control, several, data snooping has left out."""
+    of_control = np.isin(a.data.rays.point, np.flatnonzero(a.problem.given.any(axis=1)))
+    kept, n = (np.bincount(a.data.rays.image[of_control & which], minlength=len(a.data.images))
+               for which in (a.solution.ray_weight, np.ones(len(of_control), dtype=bool)))  # fmt: skip
+    return [
+        f"image {entry.name}: all its {n[k]} pixels of control are left out: it lies where its metadata and the other "
+        "images say; are lines and samples, or places, those of this image?"
+        for k, entry in enumerate(a.data.images)
+        if n[k] > 2 and not kept[k]
+    ]
 
 
 def _control_notes(a: SceneAdjustment) -> list[str]:

@@ -349,6 +349,9 @@ def test_an_image_that_its_points_show_upside_down_is_told(made, tmp_path, capsy
         image.to_csv(block / "image_points.csv", index=False)
         assert main(["adjust", str(block), "-q"]) == 0
         assert (told in capsys.readouterr().out) == turned
+        # of the two rays of each control point snooping leaves out one: heights are off by 40 km, and sigma0 is 1
+        assert main(["adjust", str(block), "-q", "--snoop"]) == 0
+        assert ("note: image F: all its 9 pixels of control are left out" in capsys.readouterr().out) == turned
 
 
 def test_one_swapped_control_point_of_polynomials_is_refused(made, tmp_path, capsys):
