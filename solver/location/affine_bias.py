@@ -22,8 +22,8 @@ _STEP_M = 1.0
 #: Points nearer to a line than this, pixels and as a share of its length, do not tell what is beside it. Derived: a
 #: tenth of a pixel of theirs would be many pixels across the image.
 _NARROW_PX, _NARROW = 1.0, 1e-3
-#: A correction that moves pixels by more than this share of their distance is told. Tuned: no metadata of an
-#: image are as wrong, a heading off by five degrees is told not yet.
+#: A correction that moves pixels by more than this share of their distance is told. Tuned: no metadata of an image are
+#: as wrong; a heading that is five degrees off is not told yet.
 LARGE_TURN = 0.1
 #: Two-sided level of the test of one point, the usual one of data snooping.
 SNOOPING_LEVEL = 0.001
