@@ -1,9 +1,9 @@
 """Several recordings of one block (days, aircraft) as one block.
 
-Points with the same name are one point: known points as they are; tie points only where the rays of the recordings meet
-near each other, and near the same way as at their neighbours, since names that a matcher gave come again for other
-points, on the same flight line not even far away. Strips keep their own corrections, and the a-priori sigmas of their
-recording.
+Points with the same name are one point: known points as they are; tie points only where the rays of one recording meet
+near those of the other, and about as far off, in the same direction, as at the points around. A matcher gives its names
+again for other points, which lie near each other where a flight line is flown twice. Strips keep their own corrections,
+and the a-priori sigmas of their recording.
 """
 
 from __future__ import annotations

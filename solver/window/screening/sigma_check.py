@@ -313,11 +313,11 @@ class SigmaCheck:
             if max(now[i] / self._told[i], self._told[i] / now[i]) < TOLD_AGAIN:
                 continue
             self._told[i] = now[i]
-            self.events.append(
-                f"sigmas: {name} is {now[i]:.1f} times as large as stated"
-                if now[i] > 1.0
-                else f"sigmas: {name} is as stated"
-            )
+            words = f"sigmas: {name} is " + (f"{now[i]:.1f} times as large as stated" if now[i] > 1.0 else "as stated")
+            if name == "image" and self._network.pose_noise.possible_vibration > vibration:
+                may_be = np.degrees(self._network.pose_noise.possible_vibration)
+                words += f", or the attitude vibrates by {1e3 * may_be:.1f} mdeg"
+            self.events.append(words)
             if name == CALIBRATION and now[i] > 1.0:
                 self.events.append(
                     f"camera: looks are off its calibration by {calibration.worst(self._network.camera)}"
