@@ -74,8 +74,18 @@ def _step(text: str) -> Step:
 
 
 def _sine(text: str) -> Sine:
-    size, _, frequency = text.partition("@")
-    return Sine(_three(size), _unit(("Hz", 1.0))(frequency))
+    size, _, rest = text.partition("@")
+    frequency, at, part = rest.partition("@")
+    sine = Sine(_three(size), _unit(("Hz", 1.0))(frequency))
+    if not at:
+        return sine
+    begin, _, end = part.partition("-")
+    return replace(sine, from_s=_one(begin), to_s=_unit(("s", 1.0))(end))
+
+
+def _shown_sine(sine: Sine) -> str:
+    text = f"{_shown(sine.amplitude_deg)}@{sine.frequency_hz:g}"
+    return text if np.isinf([sine.from_s, sine.to_s]).all() else f"{text}@{sine.from_s:g}-{sine.to_s:g}"
 
 
 def _heavy(text: str) -> bool:
@@ -97,8 +107,8 @@ KEYS: dict[str, Key] = {
         lambda v: _shown(v.size_m) + ("" if v.time_s is None else f"@{v.time_s:g}"), many=True,
     ),
     "sine": Key(
-        "sines", "deg@Hz of the attitude, deg one or omega,phi,kappa", _sine,
-        lambda v: f"{_shown(v.amplitude_deg)}@{v.frequency_hz:g}", many=True,
+        "sines", "deg@Hz of the attitude, deg one or omega,phi,kappa, @ from-to seconds of the flight (else all along)",
+        _sine, _shown_sine, many=True,
     ),
     "boresight": Key("boresight_deg", "deg, one or roll,pitch,heading", _three, _shown),
     "lever-arm": Key("lever_arm_m", "m, one or three in the body frame", _three, _shown),

@@ -244,9 +244,9 @@ class PoseNoise:
         return _with_left(measured, left)
 
 
-def of_vibration(vibration: float) -> Array:
-    """Covariance (6, 6) of a pose by noise of the attitude from look to look, rad."""
-    return np.diag([0.0, 0.0, 0.0, *[vibration**2] * 3])
+def of_vibration(vibration: float | Array) -> Array:
+    """Covariance (..., 6, 6) of poses by noise (...) of the attitude from look to look, rad."""
+    return np.square(vibration)[..., None, None] * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
 
 
 def _size(left: Array) -> float:

@@ -46,10 +46,13 @@ class Step:
 
 @dataclass(frozen=True)
 class Sine:
-    """Omega, phi and kappa as measured swing by ``amplitude_deg`` at ``frequency_hz``, each with a phase of its own."""
+    """Omega, phi and kappa as measured swing by ``amplitude_deg`` at ``frequency_hz``, each with a phase of its own,
+    from ``from_s`` to ``to_s``, as in air that is rough there."""
 
     amplitude_deg: Three
     frequency_hz: float
+    from_s: float = -np.inf
+    to_s: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,8 @@ class World:
         for sine in self.sines:
             if not 0 < sine.frequency_hz < np.inf:
                 raise ValueError(f"true world: frequency of a sine must be positive, got {sine.frequency_hz}")
+            if not sine.from_s < sine.to_s:
+                raise ValueError(f"true world: a sine from {sine.from_s:g} to {sine.to_s:g} s, wanted a later end")
         if not abs(self.focal_length_um) < np.inf:
             raise ValueError(f"true world: focal_length_um must be finite, got {self.focal_length_um}")
         if not abs(self.distortion_px) <= MOST:
@@ -187,7 +192,7 @@ class World:
 
         Raises
         ------
-        ValueError : a step outside the flight
+        ValueError : a step, or all of a sine, outside the flight
         """
         parts: list[Callable[[Array], Array]] = []
         if any(self.random_walk_m):
@@ -198,6 +203,10 @@ class World:
             if not start_s <= time_s <= end_s:
                 raise ValueError(f"true world: step at {time_s:g} s, wanted a time in {start_s:g} to {end_s:g} s")
             parts.append(_step(step.size_m, time_s))
+        for sine in self.sines:
+            if not (sine.from_s < end_s and sine.to_s > start_s):
+                part = f"sine from {sine.from_s:g} to {sine.to_s:g} s"
+                raise ValueError(f"true world: {part}, wanted times in {start_s:g} to {end_s:g} s")
         phases = stream(seed, "sine")
         parts += [_sine(sine, phases.uniform(0, 2 * np.pi, 3)) for sine in self.sines]
         if any(self.gnss_datum_m):
@@ -287,7 +296,8 @@ def _sine(sine: Sine, phase: Array) -> Callable[[Array], Array]:
 
     def at(time_s: Array) -> Array:
         angle = 2 * np.pi * sine.frequency_hz * time_s[:, None] + phase
-        return np.hstack([np.zeros((len(time_s), 3)), amplitude * np.sin(angle)])
+        there = (time_s >= sine.from_s) & (time_s <= sine.to_s)
+        return np.hstack([np.zeros((len(time_s), 3)), amplitude * np.sin(angle) * there[:, None]])
 
     return at
 

@@ -133,21 +133,20 @@ class Leaving:
 
     def _release_orientation(self, strip: WindowStrip, numbers: IntArray, to_s: float, update: Update) -> None:
         """Publish the orientation of a strip up to a time, and marginalise unknowns that no later time needs."""
-        final = self._final(strip, to_s)
+        network, final = self._network, self._final(strip, to_s)
         left = None
         if final is not None:
             update.final.append(final)
             noise = self._orientation.noise(strip, final.time_s)
-            vibration, design = self._network.pose_noise.vibration, strip.design(final.time_s)
-            noisier = vibration > 0.0 or self._network.sigmas.image > 1.0
-            left = LeftOrientation(final, design, noise, vibration, noisier)
+            vibration, design = network.vibrations.since(final.time_s), strip.design(final.time_s)
+            left = LeftOrientation(final, design, noise, vibration, doubtful=network.sigmas.image > 1.0)
             self._block.orientation(strip, left)
         strip.final_to_s = to_s
         self._marginalise(numbers, left)
-        if strip.ended and strip.is_gone(self._network.state):
+        if strip.ended and strip.is_gone(network.state):
             for step in self._steps:  # those of a strip that is no part of a block
                 if step.orientation is not None and step.orientation.published.strip == strip.id:
-                    step.orientation.over(self._network.pose_noise.possible_vibration)
+                    step.orientation.over(network.vibrations)
             self._block.gone(strip)
             strip.release()
 

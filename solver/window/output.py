@@ -95,8 +95,8 @@ class OrientationOutput:
         correction, covariance = (np.concatenate([p[i] for p in parts]) for i in range(2))
         angles = corrected_angles(measured.poses.angles, correction[:, 3:])
         angles[:, 2] = (angles[:, 2] + np.pi) % (2 * np.pi) - np.pi
-        noise = self._network.pose_noise
-        covariance = covariance + noise.at(measured, strip.followed) + of_vibration(noise.possible_vibration)
+        noise = self._network.pose_noise.at(measured, strip.followed)
+        covariance = covariance + noise + of_vibration(self._network.vibrations.since(times))
         covariance += measured.open_end[:, :, None] * np.eye(6)
         return RefinedOrientation(
             strip.id, times, measured.poses.position_l + correction[:, :3], angles, covariance, correction

@@ -22,6 +22,7 @@ from ...models.base import Design
 from ..results import AdjustedPoint, RefinedOrientation, WholeStrips
 from ..state.batch import Batch, inverse_factors
 from ..state.unknowns import Marginal, WindowState
+from ..state.vibrations import Vibrations
 from .solution import DenseSolution, Solution
 
 #: Times of orientation that are refined at once: so few that observations have their unknowns in common. Tuned.
@@ -63,20 +64,20 @@ class LeftOrientation:
     published : at n times
     design : how its corrections depend on the unknowns
     noise : (n, 6, 6) covariance that comes from none of them, and is no vibration
-    vibration : of the attitude from look to look, rad, as it was known then
-    noisier : whether looks were noisier than stated then
+    vibration : (n,) of the attitude from look to look, rad, as it was known then
+    doubtful : whether looks were noisier than stated then, which was not known to be a vibration
     """
 
     published: RefinedOrientation
     design: Design
     noise: Array
-    vibration: float
-    noisier: bool
+    vibration: Array
+    doubtful: bool
 
-    def over(self, vibration: float) -> None:
-        """The strip is over, and noise of its looks is, or may be, a vibration of the attitude, rad."""
-        if self.noisier:
-            self.vibration = max(self.vibration, vibration)
+    def over(self, vibrations: Vibrations) -> None:
+        """The strip is over: what was noise of its looks has turned out to be a vibration of the attitude, or not."""
+        if self.doubtful:
+            self.vibration = vibrations.since(self.published.time_s)
 
     def refined(self, solution: Solution) -> RefinedOrientation:
         """The orientation as a solution of whole strips gives it."""

@@ -121,7 +121,7 @@ class Block:
         self.conclude()
         if strip.id in self._archive.strips:
             for orientation in self._archive.strips[strip.id].orientation:
-                orientation.over(self._network.pose_noise.possible_vibration)
+                orientation.over(self._network.vibrations)
         self._touched.discard(strip.id)
         self._archive.end_strip(strip)
         self._new.append(strip.id)

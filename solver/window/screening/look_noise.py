@@ -154,6 +154,13 @@ class NoiseOfLooks:
         noise.possible_vibration = unstated if doubtful else noise.vibration
         return not as_before
 
+    def note_vibration(self, now_s: float) -> None:
+        """Note what is known now of a vibration of the attitude."""
+        noise = self._network.pose_noise
+        resolved = self._of_the_image or noise.vibration > 0.0
+        possible = None if resolved else noise.possible_vibration
+        self._network.vibrations.note(now_s, noise.vibration, possible)
+
 
 @dataclass(frozen=True)
 class Residuals:

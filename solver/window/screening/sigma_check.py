@@ -139,6 +139,7 @@ class SigmaCheck:
             self._changed_s = now_s
             self._restate(strip, np.clip(factor, 1.0, LARGEST), at_most_s)
             network.state.solve()
+        self._looks.note_vibration(now_s)
         self._tell()
         if self.settled(now_s) and sigmas.disagreement == 1.0:  # sigmas that are too small make anything certain
             self._tell_platform()

@@ -25,6 +25,7 @@ from .strip import WindowStrip
 from .surface import LiveSurface
 from .tails import Tails
 from .unknowns import Information, WindowState
+from .vibrations import Vibrations
 
 
 class Batches:
@@ -170,6 +171,7 @@ class LiveNetwork:
     intake : points that are not final, with their looks, and known coordinates
     batches : points with their equations
     pose_noise : what the corrections leave of the noise of poses
+    vibrations : what has been estimated of vibrations of the attitude
     sigmas : what a-priori sigmas are multiplied by
     tails : how many looks fail narrowly
     platform : constant errors of the platform
@@ -191,6 +193,7 @@ class LiveNetwork:
         self.intake = Intake(camera, self.strips, self.trajectory)
         self.batches = Batches(self.state)
         self.pose_noise = PoseNoise(self.trajectory)
+        self.vibrations = Vibrations()
         self.sigmas = SigmaFactors()
         self.tails = Tails()
         self.platform = LivePlatform(platform, self.trajectory, self.state)

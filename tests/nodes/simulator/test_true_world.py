@@ -16,8 +16,8 @@ from triline.solver.simulation.misstated import AS_STATED, Sine, Step
 SHORT = ["--seconds", "8", "--lead-in", "1", "--attitude-rate", "20", "--ties", "2", "--seed", "5"]
 TERMS = [
     "wander-factor=2", "wander-time-factor=0.333", "random-walk=0.03", "step=0.3", "step=0.1,0,0.2@12",
-    "sine=0.02@0.1", "sine=0.01,0,0@3", "boresight=0.05,0,0.1", "lever-arm=0.2", "focal-length=20",
-    "distortion=3", "clock=0.005",
+    "sine=0.02@0.1", "sine=0.01,0,0@3", "sine=0.01@3@25-45.5", "boresight=0.05,0,0.1", "lever-arm=0.2",
+    "focal-length=20", "distortion=3", "clock=0.005",
     "tie-noise=t3", "tie-noise-factor=2", "gnss-datum=0.5", "control-datum=0,0,-0.5",
 ]  # fmt: skip
 
@@ -28,6 +28,7 @@ def test_every_key_is_read_and_written_back():
     assert {term.partition("=")[0] for term in TERMS} == set(KEYS)
     assert world.steps == (Step((0.3, 0.3, 0.3)), Step((0.1, 0.0, 0.2), 12.0))
     assert world.sines[0] == Sine((0.02, 0.02, 0.02), 0.1)
+    assert world.sines[2] == Sine((0.01, 0.01, 0.01), 3.0, 25.0, 45.5)
     assert world_from(["clock=5ms", "focal-length=0.02mm", "step=1@3s", "sine=1@2Hz"]) == world_from(
         ["clock=0.005", "focal-length=20um", "step=1 1 1@3", "sine=1@2"]
     )
@@ -45,6 +46,8 @@ def test_every_key_is_read_and_written_back():
         ("step=0.3@", "wanted step=VALUE"),
         ("sine=0.02", "wanted sine=VALUE with VALUE deg@Hz"),
         ("sine=0.02@0", "frequency of a sine must be positive"),
+        ("sine=0.02@3@45", "wanted sine=VALUE with VALUE deg@Hz"),
+        ("sine=0.02@3@45-25", "a sine from 45 to 25 s, wanted a later end"),
         ("boresight=1,2", "one or roll,pitch,heading"),
         ("focal-length=nan", "wanted focal-length=VALUE with VALUE um"),
         ("tie-noise=t5", "t3 or normal"),

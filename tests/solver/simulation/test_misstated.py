@@ -155,6 +155,16 @@ def test_a_sine_has_its_amplitude_and_frequency(stated):
     assert np.abs(change - design @ found).max() < 1e-4
 
 
+def test_a_sine_may_last_for_a_part_of_the_flight(stated):
+    all_along, part = (flown(World(sines=(Sine((0.02,) * 3, 0.5, *part),))) for part in ((), (2.0, 5.0)))
+    there = (stated.attitude_time_s >= 2.0) & (stated.attitude_time_s <= 5.0)
+    expected = np.where(there[:, None], attitude_change(all_along, stated), 0.0)
+    assert there.any() and not there.all()
+    assert attitude_change(part, stated) == pytest.approx(expected, abs=1e-9)
+    with pytest.raises(ValueError, match="sine from 2000 to 2001 s, wanted times in 0 to"):
+        flown(World(sines=(Sine((0.02,) * 3, 0.5, 2000.0, 2001.0),)))
+
+
 def test_a_clock_moves_position_and_attitude_by_their_rates(stated):
     dt = 0.005
     simulation = flown(World(clock_s=dt))
