@@ -28,6 +28,8 @@ from ..errors import UserError
 from ..formats.camera_json import read_camera_instead
 from ..formats.geotiff import Heights
 from ..formats.line_orientation import OrientedLines
+from ..formats.table import column_names_of
+from ..formats.time_columns import time_columns
 from ..formats.trajectory_csv import Poses, read_poses_of_strips
 from ..recording.access import PoseTable, Recording
 from ..recording.summary import lacking
@@ -349,6 +351,11 @@ class OfTable:
     """
 
     def __init__(self, recording: Recording, path: Path, wanted: list[str] | None = None, lens: str = "") -> None:
+        if not time_columns(column_names_of(path)):
+            raise UserError(
+                f"{path}: no column of times, wanted a table of `triline adjust` or `triline export --per-line`; "
+                "`triline import` takes trajectories of other programs"
+            )
         poses = read_poses_of_strips(path, project_frame(recording))
         found: dict[str | None, Poses] = {}
         if not poses.rows:

@@ -472,7 +472,8 @@ def ground_under(args: argparse.Namespace, sensor: _Sensor) -> Ground:
     if covered == 0.0:
         raise UserError(f"{raster.name}: knows no height under the image")
     if covered < 1.0:
-        sensor.notes.append(f"{raster.name}: covers {100 * covered:.0f} % of the image, the rest is missing")
+        share = "more than 99" if covered > 0.99 else f"{100 * covered:.0f}"
+        sensor.notes.append(f"{raster.name}: covers {share} % of the image, the rest is missing")
     return Ground(raster, low, high, covered, f"heights of {raster.name} {raster.datum}")
 
 

@@ -969,9 +969,17 @@ def test_rasters_round_the_earth_have_no_gap_where_they_begin(scene, tmp_path, f
 
 
 def test_heights_that_cover_a_part_and_tiles_of_heights(scene, tmp_path, capsys):
-    _, path, _, relief, dem, image = scene
+    _, path, model, relief, dem, image = scene
     half = tmp_path / "tiles"
     half.mkdir()
+    corner = np.degrees(np.ravel(model.direct(0.0, 0.0, float(relief.z.mean())))[:2])
+    column, row = (corner[1] - relief.lon_deg) / relief.step_deg, (relief.lat_deg - corner[0]) / relief.step_deg
+    hole = replace(relief)
+    hole.z = relief.z.copy()
+    hole.z[int(row) - 1 : int(row) + 3, int(column) - 1 : int(column) + 3] = np.nan
+    words = [image, "--sensor", path, "-o", tmp_path / "o.tif", "--dem", hole.write(tmp_path / "hole.tif")]
+    assert main(["rectify", *map(str, words), "--dem-datum", "ellipsoid", "--gsd", "100"]) == 0
+    assert "hole.tif: covers more than 99 % of the image, the rest is missing" in capsys.readouterr().out
     left, right = (
         replace(relief, columns=61),
         replace(relief, lon_deg=relief.lon_deg + 60 * relief.step_deg, columns=60),
@@ -986,10 +994,10 @@ def test_heights_that_cover_a_part_and_tiles_of_heights(scene, tmp_path, capsys)
     tiles = rectify(tmp_path, image, path, "--dem", half, *args, name="tiles.tif").read()
     assert whole.shape == tiles.shape and np.abs(whole - tiles).max() < 1e-3
     before = (half / "left.tif").read_bytes()
-    for words in (["-o", half / "left.tif"], ["-o", tmp_path / "o.tif", "--sigma", half / "left.tif"]):
+    for words in (["-o", half / "left.tif"], ["-o", tmp_path / "p.tif", "--sigma", half / "left.tif"]):
         told = refused(capsys, image, "--sensor", path, "--dem", half, "--dem-datum", "ellipsoid", *words)
         assert "left.tif: the output would overwrite" in told
-    assert (half / "left.tif").read_bytes() == before and not (tmp_path / "o.tif").exists()
+    assert (half / "left.tif").read_bytes() == before and not (tmp_path / "p.tif").exists()
 
 
 def test_a_mosaic_begins_anew_where_a_tile_of_heights_or_the_geoid_has_changed(scene, tmp_path, capsys):

@@ -301,6 +301,10 @@ def test_lines_have_the_poses_of_their_own_strip_where_two_are_imaged_at_the_sam
     assert capsys.readouterr().err.endswith("flown_lines.csv: strip: no rows of 'S2', there are: S1\n")
     assert main([*words, "--gsd", "20", "--height", "0"]) == 0
     assert "note: flown_lines.csv has no rows of strip S2" in capsys.readouterr().out
+    sbet = folder / "mission.sbet"
+    sbet.write_bytes(np.linspace(0.0, 1.0, 17 * 4).tobytes())
+    assert main([*words[:-1], str(sbet)]) == 1
+    assert "mission.sbet: no column of times, wanted a table of `triline adjust` or" in capsys.readouterr().err
 
 
 def test_parameters_of_other_things_than_the_camera_do_not_hide_those_of_the_camera(flown, folder):
