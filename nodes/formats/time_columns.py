@@ -79,11 +79,18 @@ def times_of(table: Table, columns: list[Column], day: date | None, notes: list[
 
 def same_day(path: Path, first_ns: int, day: date | None) -> None:
     """Raise UserError where a file that knows its day knows another than the user's (they may differ by a night)."""
-    if day is None:
-        return
-    own = datetime.fromtimestamp(first_ns // SECOND_NS, UTC).date()
-    if abs((own - day).days) > 1:
+    if day is not None and not is_same_day(first_ns, day):
+        own = _day_of(first_ns)
         raise UserError(f"{path}: --date {day}, but its times begin on {own}; wanted the same day, or no --date")
+
+
+def is_same_day(first_ns: int, day: date) -> bool:
+    """Whether a UTC is of a day, or within a night of it."""
+    return abs((_day_of(first_ns) - day).days) <= 1
+
+
+def _day_of(time_ns: int) -> date:
+    return datetime.fromtimestamp(time_ns // SECOND_NS, UTC).date()
 
 
 def instant_ns(text: str, what: str) -> int:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from ..convert import LATEST_S
 from ..errors import UserError
 from .byte_order_mark import without_mark
+from .gps_time import GPS_EPOCH_S, utc_ns_from_gps
 from .plausible import check_units
 from .table import MOST_PROBLEMS, one_line
-from .time_columns import same_day
+from .time_columns import is_same_day, same_day
 from .track import NavigationTrack, checked
 
 _HEADWALL = ("Roll", "Pitch", "Yaw", "Lat", "Lon", "Alt")
@@ -69,13 +70,20 @@ def read_headwall(path: Path, day: date | None = None) -> NavigationTrack:
 
 
 def read_resonon(path: Path, day: date | None = None) -> NavigationTrack:
-    """Poses of an ``.lcf``: time (s since 1970), roll, pitch, yaw (rad), longitude, latitude (deg), altitude (m).
+    """Poses of an ``.lcf``: time (GPS seconds since 1980), roll, pitch, yaw (rad), longitude, latitude (deg), altitude
+    above the ellipsoid (m), two numbers that mean nothing, and 5 of a line to be used, 0 of another.
+
+    As Resonon specifies it roll is positive with the right wing up, against the rule of all other files. Times are
+    seconds since 1970 (UTC) where only these are of the day that is given.
 
     Raises
     ------
     UserError : a value that is missing or malformed (with its line), degrees where radians are wanted, another day
     """
-    lines = [(i, text.split()) for i, text in _lines(path) if not text.startswith("#")]
+    every = [(i, text.split()) for i, text in _lines(path) if not text.startswith("#")]
+    rows = np.array([k for k, (_, fields) in enumerate(every) if fields[9:10] != ["0"]], dtype=np.intp)
+    rows = rows if len(rows) else np.arange(len(every))  # of a program that does not know this column
+    lines = [every[k] for k in rows]
     values = _numbers(path, lines, {name: i for i, name in enumerate(_LCF)})
     angles = np.abs(values[:, 1:4])
     bad = np.argwhere(angles > 2 * np.pi + 1e-3)
@@ -85,16 +93,26 @@ def read_resonon(path: Path, day: date | None = None) -> NavigationTrack:
         raise UserError(
             one_line([f"{where}: {values[row, 1 + column]:g}, wanted radians; are they degrees?"], len(bad) - 1)
         )
-    bad = np.flatnonzero(~(np.abs(values[:, 0]) < LATEST_S))
+    seconds = values[:, 0]
+    bad = np.flatnonzero(~((seconds >= 0.0) & (seconds < LATEST_S - GPS_EPOCH_S)))
     if len(bad):
-        what = f"{path}:{lines[bad[0]][0]}: {_LCF[0]}: {values[bad[0], 0]:.6g}, wanted seconds since 1970-01-01 UTC"
+        what = f"{path}:{lines[bad[0]][0]}: {_LCF[0]}: {seconds[bad[0]]:.6g}, wanted GPS seconds since 1980-01-06"
         raise UserError(one_line([what], len(bad) - 1))
-    whole = np.floor(values[:, 0])
-    time_ns = whole.astype(np.int64) * 1_000_000_000 + np.rint((values[:, 0] - whole) * 1e9).astype(np.int64)
+    time_ns, scale = utc_ns_from_gps(0, seconds), "GPS seconds since 1980-01-06"
+    since_1970_ns = np.rint(seconds * 1e6).astype(np.int64) * 1000
+    if day is not None and not is_same_day(int(time_ns[0]), day) and is_same_day(int(since_1970_ns[0]), day):
+        time_ns, scale = since_1970_ns, "seconds since 1970-01-01 (UTC)"
     same_day(path, int(time_ns[0]), day)
-    notes = (f"{path.name}: times are taken as seconds since 1970-01-01 (UTC), altitude as height above the ellipsoid",)
-    track = NavigationTrack(path.stem, time_ns, values[:, [5, 4, 6]], values[:, 1:4], notes=notes)
-    return check_units(checked(track, path), path, {"lat": "latitude", "lon": "longitude", "heading": "yaw"})
+    begin = np.datetime64(int(time_ns[0]), "ns").astype("datetime64[s]")
+    notes = (
+        f"{path.name}: times are taken as {scale}: the flight begins at {begin}Z",
+        f"{path.name}: roll is taken as positive with the right wing up, altitude as height above the ellipsoid",
+    )
+    if len(lines) < len(every):
+        notes += (f"{path.name}: {len(every) - len(lines)} poses that the file says not to use were left out",)
+    rpy = values[:, 1:4] * [-1.0, 1.0, 1.0]
+    track = NavigationTrack(path.stem, time_ns, values[:, [5, 4, 6]], rpy, notes=notes)
+    return check_units(checked(track, path, rows), path, {"lat": "latitude", "lon": "longitude", "heading": "yaw"})
 
 
 def _utc_ns(words: list[str]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:

@@ -198,7 +198,7 @@ def _found_times(target):
         ("camera.json", lambda t: _json(t, _pixels), r"lines\[0\].pixels: 2147483648, wanted .* at most 1000000"),
         ("block: camera.json", lambda t: _json(t, _pixels), r"lines\[0\].pixels: 2147483648, wanted"),
         ("scene folder: camera.json", lambda t: _json(t, _table), r"lines\[0\].table: no file '999"),
-        ("Resonon poses", _found_times, r"flight.lcf:3: time: 1e\+18, wanted seconds since 1970"),
+        ("Resonon poses", _found_times, r"flight.lcf:3: time: 1e\+18, wanted GPS seconds since 1980"),
         ("sensor folder: imu.csv", _found_times, r"imu.csv:3: time_s: 1e\+18, wanted seconds"),
         ("sensor folder: gnss.csv", _found_times, r"gnss.csv:3: time_s: 1e\+18, wanted seconds"),
     ],

@@ -433,9 +433,11 @@ def test_headwall_damaged(tmp_path):
             read_track(path, "headwall", Options(day=day))
 
 
-def lcf_rows():
-    turn = "\t".join(f"{radians(v):.9f}" for v in (1.5, -2.5, 45))
-    return [f"{1591012800 + i}.25\t{turn}\t{LON[i]:.6f}\t{LAT[i]:.6f}\t2000.0\t0\t0" for i in range(N)]
+def lcf_rows(before=0):
+    """As Resonon specifies it: roll positive with the right wing up, GPS seconds (``before`` them others)."""
+    turn = "\t".join(f"{radians(v):.9f}" for v in (-1.5, -2.5, 45))
+    start = 1591012800 + 18 - 315964800 + before
+    return [f"{start + i}.25\t{turn}\t{LON[i]:.6f}\t{LAT[i]:.6f}\t2000.0\t0\t0\t5\t12" for i in range(N)]
 
 
 def test_resonon(tmp_path):
@@ -446,6 +448,7 @@ def test_resonon(tmp_path):
     assert track.time_ns[1] == ns(START) + 1_250_000_000
     np.testing.assert_allclose(track.geodetic[3], [LAT[3], LON[3], 2000], atol=1e-6)
     np.testing.assert_allclose(np.degrees(track.rpy[0]), [1.5, -2.5, 45], atol=1e-6)
+    assert track.notes[0].endswith("GPS seconds since 1980-01-06: the flight begins at 2020-06-01T12:00:00Z")
     for text, day, wanted in (
         (
             "\n".join(lcf_rows()).replace("0.785398163", "45"),
@@ -459,6 +462,26 @@ def test_resonon(tmp_path):
         path.write_text(text)
         with pytest.raises(UserError, match=wanted):
             read_track(path, "resonon", Options(day=day))
+
+
+def test_a_day_tells_that_a_resonon_log_counts_from_1970(tmp_path):
+    path = tmp_path / "flight.lcf"
+    path.write_text("\n".join(lcf_rows(before=315964800 - 18)))
+    track = read_track(path, "resonon", Options(day=date(2020, 6, 1)))
+    assert track.time_ns[1] == ns(START) + 1_250_000_000
+    assert "seconds since 1970-01-01 (UTC)" in track.notes[0]
+    assert "begins at 2030-" in read_track(path, "resonon", Options()).notes[0]
+
+
+def test_lines_of_a_resonon_log_that_are_not_to_be_used_are_left_out(tmp_path):
+    """They have positions of before the first fix."""
+    path, rows = tmp_path / "flight.lcf", lcf_rows()
+    unused = [row.replace("\t5\t12", "\t0\t12") for row in rows]
+    path.write_text("\n".join([*unused[:2], *rows[2:]]))
+    track = read_track(path, "resonon", Options())
+    assert len(track) == N - 2 and "2 poses that the file says not to use were left out" in track.notes[-1]
+    path.write_text("\n".join(unused))
+    assert len(read_track(path, "resonon", Options())) == N
 
 
 def test_heights_above_a_geoid_that_is_not_here_are_refused(tmp_path):
