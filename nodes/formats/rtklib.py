@@ -28,7 +28,10 @@ _SIGMA = ("sdn(m)", "sde(m)", "sdu(m)")
 _VELOCITY, _SIGMA_VELOCITY = ("vn(m/s)", "ve(m/s)", "vu(m/s)"), ("sdvn", "sdve", "sdvu")
 _ECEF, _SIGMA_ECEF = ("x-ecef(m)", "y-ecef(m)", "z-ecef(m)"), ("sdx(m)", "sdy(m)", "sdz(m)")
 _MIXED_ECEF = ("sdxy(m)", "sdyz(m)", "sdzx(m)")
+_VELOCITY_ECEF, _SIGMA_VELOCITY_ECEF = ("vx(m/s)", "vy(m/s)", "vz(m/s)"), ("sdvx", "sdvy", "sdvz")
+_MIXED_VELOCITY_ECEF = ("sdvxy", "sdvyz", "sdvzx")
 _GEODETIC = ("latitude(deg)", "longitude(deg)", "height(m)")
+_NAMES = r"%.*(latitude\(|x-ecef\(|e-baseline\()"
 _HEAD_BYTES = 16_384
 
 
@@ -36,9 +39,7 @@ def is_rtklib(path: Path) -> bool:
     """Whether a text file begins like positions of RTKLIB."""
     with open(path, "rb") as file:
         head = without_mark(file.read(_HEAD_BYTES))
-    return (
-        head.startswith(b"%") and re.search(rb"^%.*(latitude\(|x-ecef\(|e-baseline\()", head, re.MULTILINE) is not None
-    )
+    return head.startswith(b"%") and re.search(f"^{_NAMES}".encode(), head, re.MULTILINE) is not None
 
 
 def read_rtklib(path: Path, notes: list[str]) -> GnssData:
@@ -49,15 +50,20 @@ def read_rtklib(path: Path, notes: list[str]) -> GnssData:
 
     Raises
     ------
-    UserError : no line of column names, columns, times or heights of another kind, a value that is malformed (with its
-        line)
+    UserError : no line of column names, or several that differ; columns, times, heights or a datum of another kind; a
+        value that is malformed (with its line)
     """
     text = read_latin(path).splitlines()
-    place = next((i for i, line in enumerate(text) if re.match(r"%.*(latitude\(|x-ecef\(|e-baseline\()", line)), None)
-    if place is None:
+    places = [i for i, line in enumerate(text) if re.match(_NAMES, line)]
+    if not places:
         raise UserError(f"{path}: no line of column names, wanted '% GPST latitude(deg) longitude(deg) ..' of RTKLIB")
-    scale, *names = re.sub(r"[,;]", " ", text[place].lstrip("% ")).split()
-    where = f"{path}:{place + 1}"
+    scale, *names = _words(text[places[0]].lstrip("% "))
+    where = f"{path}:{places[0] + 1}"
+    for other in places[1:]:  # of files that were put one behind the other
+        if _words(text[other].lstrip("% ")) != [scale, *names]:
+            raise UserError(
+                f"{path}:{other + 1}: other columns than in line {places[0] + 1}, wanted one kind in a file"
+            )
     if scale not in ("GPST", "UTC"):
         raise UserError(f"{where}: times in {scale}, wanted GPST or UTC")
     cartesian = _ECEF[0] in names
@@ -65,10 +71,12 @@ def read_rtklib(path: Path, notes: list[str]) -> GnssData:
         if name not in names:
             wanted = f"{' '.join(_GEODETIC)} (or {' '.join(_ECEF)}), Q and sigmas"
             raise UserError(f"{where}: {name}: column missing, wanted {wanted}")
-    if not cartesian and any("WGS84/geodetic" in line for line in text[: place + 1]):
-        raise UserError(f"{path}: heights above the geoid (WGS84/geodetic), wanted those above the ellipsoid")
+    if not cartesian:
+        _check_datum(path, text, notes)
     lines = [(i, line) for i, line in enumerate(text, 1) if line.strip() and not line.startswith("%")]
-    time_s, values = _values(path, lines, names, utc=scale == "UTC")
+    split = _words if re.search("[,;]", text[places[0]]) else str.split  # a decimal comma is none of RTKLIB's
+    fields = [(i, split(line)) for i, line in lines]
+    time_s, values = _values(path, fields, names, utc=scale == "UTC")
     column = dict(zip(names, values.T, strict=True))
 
     def three(columns: Sequence[str]) -> Array:
@@ -85,7 +93,27 @@ def read_rtklib(path: Path, notes: list[str]) -> GnssData:
     velocity = sigma_velocity = None
     if all(name in column for name in (*_VELOCITY, *_SIGMA_VELOCITY)):
         velocity, sigma_velocity = three(_VELOCITY) * [1.0, 1.0, -1.0], three(_SIGMA_VELOCITY)
+    elif all(name in column for name in (*_VELOCITY_ECEF, *_SIGMA_VELOCITY_ECEF, *_MIXED_VELOCITY_ECEF)):
+        velocity = np.einsum("nij,ni->nj", R_en(lat, lon), three(_VELOCITY_ECEF))
+        sigma_velocity = _along_ned(three(_SIGMA_VELOCITY_ECEF), three(_MIXED_VELOCITY_ECEF), lat, lon)
     return GnssData(time_s, lat, lon, height, sigma, velocity, sigma_velocity)
+
+
+def _words(line: str) -> list[str]:
+    return re.sub(r"[,;]", " ", line).split()
+
+
+def _check_datum(path: Path, text: Sequence[str], notes: list[str]) -> None:
+    """Raise UserError for a datum or heights of another kind; a note where the file does not say."""
+    said = {(i, *kind) for i, line in enumerate(text, 1) for kind in re.findall(r"^%.*height=(\w+)/(\w+)", line)}
+    for number, datum, height in sorted(said):
+        if datum != "WGS84":
+            raise UserError(f"{path}:{number}: positions in the datum {datum}, wanted WGS84")
+        if height != "ellipsoidal":
+            what = f"heights above the geoid (WGS84/{height}), wanted those above the ellipsoid"
+            raise UserError(f"{path}:{number}: {what}")
+    if not said:
+        notes.append(f"{path.name}: heights are taken as those above the ellipsoid of WGS 84; the file does not say")
 
 
 def _along_ned(sigma: Array, mixed: Array, lat: Array, lon: Array) -> Array:
@@ -105,12 +133,11 @@ def _along_ned(sigma: Array, mixed: Array, lat: Array, lon: Array) -> Array:
 
 
 def _values(
-    path: Path, lines: Sequence[tuple[int, str]], names: Sequence[str], *, utc: bool
+    path: Path, lines: Sequence[tuple[int, list[str]]], names: Sequence[str], *, utc: bool
 ) -> tuple[Array, NDArray[np.float64]]:
     """Times (n,), seconds since the Unix epoch, and values (n, columns) of the numbered lines."""
     times, rows, problems = [], [], []
-    for number, line in lines:
-        fields = re.sub(r"[,;]", " ", line).split()
+    for number, fields in lines:
         try:
             times.append(_utc_s(fields[0], fields[1], utc=utc))
             rows.append([float(field) for field in fields[2 : 2 + len(names)]])
@@ -119,7 +146,7 @@ def _values(
         except (ValueError, IndexError, OverflowError):
             when = "day and time" if utc else "day and time (or week and seconds)"
             wanted = f"{when} and {len(names)} values as the names say"
-            problems.append(f"{path}:{number}: {line.strip()[:60]!r}, wanted {wanted}")
+            problems.append(f"{path}:{number}: {' '.join(fields)[:60]!r}, wanted {wanted}")
             if len(problems) >= MOST_PROBLEMS:
                 break
     if problems:
@@ -138,6 +165,8 @@ def _utc_s(day: str, time: str, *, utc: bool) -> float:
     """
     if "/" in day:
         hours, minutes, seconds = time.split(":")
+        if not (0 <= int(hours) < 24 and 0 <= int(minutes) < 60 and 0.0 <= float(seconds) < 61.0):
+            raise ValueError
         days = (date.fromisoformat(day.replace("/", "-")) - date(1980, 1, 6)).days
         week, seconds_s = 0, days * DAY_S + int(hours) * 3600 + int(minutes) * 60 + float(seconds)
         if utc:

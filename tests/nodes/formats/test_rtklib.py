@@ -86,7 +86,13 @@ def test_positions_in_x_y_z_have_the_sigmas_of_north_east_and_down(tmp_path):
     values = [*xyz(*place), 1, 12, *np.sqrt(np.diag(C)), *mixed, 0.0, 9.9]
     names = "x-ecef(m) y-ecef(m) z-ecef(m) Q ns sdx(m) sdy(m) sdz(m) sdxy(m) sdyz(m) sdzx(m) age(s) ratio"
     row = "  ".join(f"{value:.9f}" for value in values)
-    gnss, _ = read(tmp_path / "a.pos", text_of(names=names, row=row))
+    moved = axes @ [20.0, -3.0, 1.0]
+    speeds = " vx(m/s) vy(m/s) vz(m/s) sdvx sdvy sdvz sdvxy sdvyz sdvzx"
+    speed = "  ".join(f"{value:.9f}" for value in (*moved, *np.sqrt(np.diag(C)), *mixed))
+    gnss, _ = read(tmp_path / "a.pos", text_of(names=names + speeds, row=f"{row}  {speed}"))
+    assert gnss.velocity_n is not None and gnss.sigma_velocity_n is not None
+    np.testing.assert_allclose(gnss.velocity_n[3], [20.0, -3.0, -1.0], atol=1e-4)
+    np.testing.assert_allclose(gnss.sigma_velocity_n[3], [0.01, 0.02, 0.05], rtol=1e-4)
     np.testing.assert_allclose(np.degrees([gnss.lat[0], gnss.lon[0]]), place[:2], atol=1e-9)
     np.testing.assert_allclose(gnss.height_m, place[2], atol=1e-6)
     np.testing.assert_allclose(gnss.sigma_ned_m, np.tile([0.01, 0.02, 0.05], (8, 1)), rtol=1e-4)
@@ -97,6 +103,14 @@ def test_positions_in_x_y_z_have_the_sigmas_of_north_east_and_down(tmp_path):
     [
         (lambda t: t.replace("  GPST  ", "  JST  "), "a.pos:5: times in JST, wanted GPST or UTC"),
         (lambda t: t.replace("WGS84/ellipsoidal", "WGS84/geodetic"), "heights above the geoid .*, wanted those above"),
+        (
+            lambda t: t.replace("height=WGS84", "height=Tokyo"),
+            "a.pos:4: positions in the datum Tokyo, wanted",
+        ),
+        (lambda t: t + text_of("UTC"), "a.pos:18: other columns than in line 5, wanted one kind in a file"),
+        (lambda t: t + t.replace("WGS84/ellipsoidal", "WGS84/geodetic"), "a.pos:17: heights above the geoid"),
+        (lambda t: t.replace("612.3456", "612,3456"), "a.pos:6: .*, wanted day and time"),
+        (lambda t: t.replace("09:30:18.750", "99:30:18.750"), "a.pos:9: .*, wanted day and time"),
         (lambda t: t.replace("latitude(deg)", "latitude(d'\")"), r"latitude\(deg\): column missing, wanted"),
         (lambda t: t.replace("sdn(m)", "sd(m)"), r"sdn\(m\): column missing"),
         (lambda t: t.replace("% GPST", "").replace("latitude", "breadth"), "no line of column names, wanted '% GPST"),
@@ -112,6 +126,11 @@ def test_positions_in_x_y_z_have_the_sigmas_of_north_east_and_down(tmp_path):
 def test_files_that_cannot_be(tmp_path, change, wanted):
     with pytest.raises(UserError, match=wanted):
         read(tmp_path / "a.pos", change(text_of()))
+
+
+def test_what_a_file_does_not_say_about_heights_is_told(tmp_path):
+    _, notes = read(tmp_path / "a.pos", text_of().replace(HEIGHTS, ""))
+    assert "a.pos: heights are taken as those above the ellipsoid of WGS 84; the file does not say" in notes
 
 
 def test_positions_alone_become_fixes(tmp_path, capsys):
