@@ -90,38 +90,53 @@ def _read(path: Path, day: date | None) -> tuple[NavigationTrack, bool]:
     root = read_xml(path)
     if root.tag != "gpx":
         raise UserError(f"{path}: XML with the root {root.tag!r}, wanted gpx")
-    points = root.all("trk/trkseg/trkpt", "a track with points that have time and ele", least=2)
+    every = root.all("trk/trkseg/trkpt", "a track with points that have time and ele", least=2)
+    rows = np.flatnonzero([_text(point, "fix") != "none" for point in every])
+    if len(rows) < 2:
+        raise UserError(f"{path}: {len(rows)} points with a fix, wanted at least 2")
+    points = [every[i] for i in rows]
     problems: list[str] = []
     place = np.array([_place(point, problems) for point in points])
     words = [_text(point, "time") or "" for point in points]
     read = pd.to_datetime(pd.Series(words, dtype=object), format="ISO8601", utc=True, errors="coerce")
     for i in np.flatnonzero(read.isna().to_numpy())[:MOST_PROBLEMS]:
         problems.append(str(points[i].refuse("time", _TIME, words[i] or None)))
-    angles = {quantity: _angles(points, names, problems) for quantity, names in _ANGLES.items()}
+    named = {
+        quantity: next((name for name in names if any(_text(point, name) is not None for point in points)), "")
+        for quantity, names in _ANGLES.items()
+    }
+    oriented = all(named.values())
+    rpy = np.zeros((len(points), 3))
+    if oriented:
+        rpy = np.radians(np.column_stack([_degrees(points, name, problems) for name in named.values()]))
     if problems:
         raise UserError(one_line(problems))
     time_ns = read.dt.tz_convert(None).to_numpy().astype("datetime64[ns]").astype(np.int64)
     same_day(path, int(time_ns[0]), day)
-    oriented = all(values is not None for values, _ in angles.values())
     notes = []
-    if oriented and angles["heading"][1] == "course":
+    if len(points) < len(every):
+        notes.append(f"{path.name}: {len(every) - len(points)} points without a fix were left out")
+    if oriented and named["heading"] == "course":
         notes.append(f"{path.name}: heading taken from course, as programs write it that give roll and pitch")
     separation = [_number(point, "geoidheight") for point in points]
     if all(value is not None for value in separation):
         place[:, 2] += np.array(separation, dtype=float)
     else:
         notes.append(f"{path.name}: ele is taken as height above the ellipsoid (no geoidheight of all points)")
-    rpy = np.zeros((len(points), 3))
-    if oriented:
-        rpy = np.radians(np.column_stack([values for values, _ in angles.values() if values is not None]))
-    return checked(NavigationTrack(path.stem, time_ns, place, rpy, notes=tuple(notes)), path), oriented
+    return checked(NavigationTrack(path.stem, time_ns, place, rpy, notes=tuple(notes)), path, rows), oriented
 
 
 def _text(point: Element, name: str) -> str | None:
-    """Text of the first element of a name anywhere below a point, whatever its namespace and case; None for none."""
-    for node in point.node.iter():
-        if isinstance(node.tag, str) and node.tag.lower() == name:
-            return (node.text or "").strip()
+    """Text of an element of a name below a point, whatever its namespace and case; None for none.
+
+    The one that stands the least deep counts: deeper ones are of other things, as the angles of a gimbal.
+    """
+    level = list(point.node)
+    while level:
+        for node in level:
+            if isinstance(node.tag, str) and node.tag.lower() == name:
+                return (node.text or "").strip()
+        level = [child for node in level for child in node]
     return None
 
 
@@ -151,15 +166,10 @@ def _place(point: Element, problems: list[str]) -> tuple[float, float, float]:
     return found[0], found[1], np.nan if ele is None else ele
 
 
-def _angles(
-    points: list[Element], names: tuple[str, ...], problems: list[str]
-) -> tuple[NDArray[np.float64] | None, str]:
-    """Degrees (n,) by the first of the names that the first point has, and that name; None where it has none."""
-    name = next((name for name in names if _text(points[0], name) is not None), "")
-    if not name:
-        return None, ""
+def _degrees(points: list[Element], name: str, problems: list[str]) -> NDArray[np.float64]:
+    """Angles (n,) under a name."""
     values = [_number(point, name) for point in points]
     for point, value in zip(points, values, strict=True):
         if value is None and len(problems) < MOST_PROBLEMS:
             problems.append(str(point.refuse(name, "degrees", _text(point, name))))
-    return np.array([np.nan if value is None else value for value in values]), name
+    return np.array([np.nan if value is None else value for value in values])

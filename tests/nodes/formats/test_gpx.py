@@ -71,6 +71,32 @@ def test_points_without_attitudes_are_fixes(tmp_path, capsys):
             read()
 
 
+def test_angles_of_a_gimbal_are_not_those_of_the_aircraft(tmp_path):
+    """They stand deeper; the first of a name in the file counted, heading of the gimbal beside roll of the aircraft."""
+    gimbal = "<d:gimbal><d:roll>0</d:roll><d:pitch>-90</d:pitch><d:yaw>10</d:yaw></d:gimbal>"
+    more = [attitude(i, "yaw").replace("<extensions>", f"<extensions>{gimbal}") for i in range(4)]
+    track = read_track(write(tmp_path / "a.gpx", [point(i, more[i]) for i in range(4)]), "gpx", Options())
+    np.testing.assert_allclose(np.degrees(track.rpy[3]), [0.3, -1.0, 2.5])
+
+
+def test_points_without_a_fix_are_left_out(tmp_path):
+    more = ["<fix>none</fix>", "<fix>3d</fix>", "<fix>dgps</fix>", ""]
+    path = write(tmp_path / "a.gpx", [point(i, more[i], lat="0" if i == 0 else None) for i in range(4)])
+    imported = read_any(path)
+    assert [m.body.latitude for m in imported.messages if m.topic == "sensor/gnss"] == [48.00055, 48.0011, 48.00165]
+    assert "a.gpx: 1 points without a fix were left out" in imported.notes
+    with pytest.raises(UserError, match=r"a.gpx: 1 points with a fix, wanted at least 2"):
+        list(read_any(write(path, [point(i, "<fix>none</fix>" * (i > 0)) for i in range(4)])).messages)
+
+
+def test_an_attitude_that_some_points_lack_is_told_and_a_course_is_none(tmp_path):
+    lacking = [point(i, attitude(i) if i else "") for i in range(4)]
+    with pytest.raises(UserError, match=r"trkpt\[1\]/roll: missing, wanted degrees \(and 2 more like it\)"):
+        read_any(write(tmp_path / "a.gpx", lacking))
+    courses = [point(i, "<course>90</course>" if i in (0, 3) else "") for i in range(4)]
+    assert len(list(read_any(write(tmp_path / "b.gpx", courses)).messages)) == 5
+
+
 def test_a_track_that_cannot_be_read_gets_one_line(tmp_path, capsys):
     good = [point(i, attitude(i)) for i in range(4)]
     where = "gpx/trk/trkseg/trkpt[3]"
