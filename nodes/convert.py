@@ -177,6 +177,8 @@ def check_place(latitude: float, longitude: float, height: float) -> None:
     """Whether a position can be one, degrees and m; raises ValueError with its values."""
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 360.0 and math.isfinite(height)):
         raise ValueError(f"position {[latitude, longitude, height]} is no latitude, longitude, height")
+    if latitude == longitude == 0.0:  # what receivers write before their first fix
+        raise ValueError(f"position {[latitude, longitude, height]} is that of a receiver without a fix")
 
 
 def check_angles(roll: float, pitch: float, heading: float) -> None:

@@ -127,7 +127,7 @@ class NavigationTrack:
 
 
 def checked(track: NavigationTrack, path: Path, rows: NDArray[np.intp] | None = None) -> NavigationTrack:
-    """The track without poses that do not come after the one before them.
+    """The track without poses of a receiver without a fix, and those that do not come after the one before them.
 
     Parameters
     ----------
@@ -138,6 +138,10 @@ def checked(track: NavigationTrack, path: Path, rows: NDArray[np.intp] | None = 
     UserError : values that no pose can have (by the number of the record), or fewer than two poses
     """
     number = np.arange(len(track)) + 1 if rows is None else rows + 1
+    placed = (track.geodetic[:, 0] != 0.0) | (track.geodetic[:, 1] != 0.0)
+    if placed.any() and not placed.all():
+        note = f"{int((~placed).sum())} poses at latitude 0, longitude 0 (no fix) were left out"
+        track, number = _part(track, placed, f"{path.name}: {note}"), number[placed]
     lat, lon, height = track.geodetic.T
     for name, values, low, high, unit in (
         ("latitude", lat, -90, 90, "deg"),
@@ -162,12 +166,17 @@ def checked(track: NavigationTrack, path: Path, rows: NDArray[np.intp] | None = 
         raise UserError(f"{path}: {int(rising.sum())} poses with rising time, wanted at least 2")
     if rising.all():
         return _with_jumps(track, path)
+    note = f"{path.name}: {int((~rising).sum())} poses do not come after the one before them and were left out"
+    return _with_jumps(_part(track, rising, note), path)
+
+
+def _part(track: NavigationTrack, which: NDArray[np.bool_], note: str) -> NavigationTrack:
+    """Some of the poses, with a note."""
     parts: dict[str, Any] = {
-        name: None if getattr(track, name) is None else getattr(track, name)[rising]
+        name: None if getattr(track, name) is None else getattr(track, name)[which]
         for name in ("time_ns", "geodetic", "rpy", "sigma_ned_m", "sigma_rpy", "covariance_n")
     }
-    note = f"{path.name}: {int((~rising).sum())} poses do not come after the one before them and were left out"
-    return _with_jumps(replace(track, **parts, notes=(*track.notes, note)), path)
+    return replace(track, **parts, notes=(*track.notes, note))
 
 
 def _with_jumps(track: NavigationTrack, path: Path) -> NavigationTrack:

@@ -134,13 +134,14 @@ def in_order(time_s: Array, subject: str, name: str) -> tuple[NDArray[np.intp], 
 def clean_gnss(gnss: GnssData) -> tuple[GnssData, list[Finding]]:
     """Fixes with positions on Earth, times that increase and sigmas above zero.
 
-    A position that is not on Earth is left out, and is fatal where most are so. A sigma that is zero or not a number is
-    replaced by the median of the good ones of its component.
+    A position that is not on Earth is left out, and is fatal where most are so. Latitude 0 with longitude 0, which
+    receivers without a fix write, is left out, too. A sigma that is zero or not a number is replaced by the median of
+    the good ones of its component.
     """
     findings = []
     rows = np.arange(len(gnss))
     position = np.column_stack([gnss.lat, gnss.lon, gnss.height_m])
-    good = np.isfinite(gnss.time_s) & np.isfinite(position).all(axis=1)
+    good = np.isfinite(gnss.time_s) & np.isfinite(position).all(axis=1) & position[:, :2].any(axis=1)
     if not good.all():
         findings.append(
             Finding("no position", "gnss.position", f"{int((~good).sum())} fixes without a position: dropped", False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -126,6 +127,14 @@ def test_positions_in_x_y_z_have_the_sigmas_of_north_east_and_down(tmp_path):
 def test_files_that_cannot_be(tmp_path, change, wanted):
     with pytest.raises(UserError, match=wanted):
         read(tmp_path / "a.pos", change(text_of()))
+
+
+def test_fixes_at_latitude_and_longitude_zero_are_dropped(tmp_path):
+    path = tmp_path / "a.pos"
+    path.write_text(re.sub(r" 48.0[01]0+ +11.50+ ", " 0.000000000 0.000000000 ", text_of()))
+    imported = read_any(path)
+    assert sum(m.topic == "sensor/gnss" for m in imported.messages) == 6
+    assert "a.pos: 2 fixes without a position: dropped" in imported.notes
 
 
 def test_what_a_file_does_not_say_about_heights_is_told(tmp_path):
