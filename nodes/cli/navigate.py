@@ -25,6 +25,7 @@ from ...solver.navigation.post_processing import (
     navigate,
     zero_velocities,
 )
+from ..convert import LINE_RATES_HZ
 from ..errors import UserError
 from ..formats.importable import refuse_importable
 from ..formats.json_text import json_text
@@ -62,8 +63,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     began = time.perf_counter()
-    if args.rate is not None and not args.rate > 0:
-        raise UserError(f"--rate {args.rate}: wanted a number above 0")
+    most = LINE_RATES_HZ[1]
+    if args.rate is not None and not 0 < args.rate <= most:
+        raise UserError(f"--rate {args.rate:g}: wanted a number above 0, at most {most:g}")
     if args.hold_out is not None and args.hold_out < 2:
         raise UserError(f"--hold-out {args.hold_out}: wanted at least 2")
     source = path_of(args.input)
@@ -88,6 +90,8 @@ def run(args: argparse.Namespace) -> int:
     _say(quiet, f"{source}: {len(inertial)} inertial samples, {len(gnss)} fixes")
     held_out = np.zeros(len(gnss), dtype=bool)
     if args.hold_out:
+        if args.hold_out > len(gnss):
+            raise UserError(f"--hold-out {args.hold_out}: there are {len(gnss)} fixes, wanted at most as many")
         held_out[args.hold_out - 1 :: args.hold_out] = True
     try:
         stretches = navigate(
@@ -113,6 +117,9 @@ def run(args: argparse.Namespace) -> int:
     with new_files(out, RESULT, FILES) as new:
         with new_file(new / TRAJECTORY) as part:
             rows = write_trajectory(part, stretches, inertial, folder, args.rate)
+            if not rows:
+                span_s = max(s.best.end_s - s.best.start_s for s in stretches)
+                raise UserError(f"--rate {args.rate:g}: no row falls into {span_s:.3g} s, wanted more a second")
         result = _result(folder, stretches, inertial, gnss, notes, held_out)
         result["rows"] = rows
         if not args.no_page:

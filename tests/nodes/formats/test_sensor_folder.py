@@ -105,6 +105,26 @@ def test_no_smooth_json_rate_and_hold_out(tmp_path, capsys):
     assert held["n"] == 19 and max(held["rms_over_sigma"]) < 2.0
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--rate", "inf"], "--rate inf: wanted a number above 0, at most 100000"),
+        (["--rate", "0.001"], "--rate 0.001: no row falls into 99 s, wanted more a second"),
+        (["--hold-out", "1000"], "--hold-out 1000: there are 99 fixes, wanted at most as many"),
+    ],
+)
+def test_a_rate_or_a_share_of_fixes_of_which_nothing_is_left_is_refused(tmp_path, capsys, options, words):
+    """A trajectory without rows took the place of the one before, and no fix was compared, without a word."""
+    folder, out = write(tmp_path / "flight"), tmp_path / "out"
+    out.mkdir()
+    (out / "trajectory.csv").write_text("earlier")
+    arguments = ["--no-smooth", "--no-page", "--no-checks", *options]
+    assert main(["navigate", str(folder), "-o", str(out), *arguments]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("triline navigate: ") and error.endswith(words)
+    assert (out / "trajectory.csv").read_text() == "earlier"
+
+
 def test_a_full_disk_leaves_no_half_file_and_the_result_of_the_earlier_run(tmp_path, capsys):
     folder, out = write(tmp_path / "flight"), tmp_path / "out"
     out.mkdir()
