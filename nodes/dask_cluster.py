@@ -29,11 +29,13 @@ def connect(address: str, name: str, timeout_s: float | None = None) -> tuple[An
     """
     try:
         import distributed
+        from distributed.comm import parse_address, registry
     except ImportError:
         raise UserError(f"--scheduler {address}: {INSTALL}") from None
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said here
     wait_s = CONNECT_S if timeout_s is None else timeout_s
     try:
+        registry.get_backend(parse_address(address)[0])  # a client that cannot begin waits long before it ends
         client: Any = distributed.Client(address, timeout=wait_s, set_as_default=False, name=name)
     except (OSError, ValueError) as error:  # what takes too long is an OSError, too
         what = "nobody answers there" if isinstance(error, OSError) else str(error)

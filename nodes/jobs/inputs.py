@@ -63,8 +63,11 @@ def sources(inputs: Iterable[str], out: Path) -> list[Source]:
         before = len(found)
         for path, name, size, modified in _remote(text) if is_url(text) else _local(text, Path(os.path.abspath(out))):
             found.setdefault(path, (name, size, modified))
-        if len(found) == before and not _names_any(text, found):
-            raise UserError(f"{text}: no recording ({RECORDING}) there")
+        if len(found) == before and (not found or not _names_any(text, found)):
+            whole, results = Path(os.path.abspath(text)), Path(os.path.abspath(out))
+            inside = not is_url(text) and results in (whole, *whole.parents)
+            hint = f"; what lies in {out}, the folder of results, is no input" if inside else ""
+            raise UserError(f"{text}: no recording ({RECORDING}) there{hint}")
     names = _told_apart({path: name for path, (name, _, _) in found.items()})
     return [Source(names[path], path, size, modified) for path, (_, size, modified) in found.items()]
 

@@ -17,6 +17,8 @@ import distributed
 import pytest
 
 from triline.nodes.cli import main
+from triline.nodes.dask_cluster import connect
+from triline.nodes.errors import UserError
 
 TRILINE = [sys.executable, "-m", "triline.nodes.cli"]
 CPU = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
@@ -158,3 +160,10 @@ def test_nobody_at_the_address_is_one_line(season, capsys, monkeypatch):
     assert main(["batch", "f0.mcap", "-o", "out", "--scheduler", "tcp://127.0.0.1:1"]) == 1
     told = capsys.readouterr().err.splitlines()
     assert told == ["triline batch: --scheduler tcp://127.0.0.1:1: nobody answers there, wanted a Dask scheduler"]
+
+
+def test_an_address_that_is_none_is_one_line_at_once(monkeypatch):
+    """The traceback of a client that could not begin followed the line, half a minute later."""
+    monkeypatch.setattr(distributed, "Client", lambda *_, **__: pytest.fail("a client was begun"))
+    with pytest.raises(UserError, match=r"--scheduler http://127.0.0.1:1: unknown address scheme 'http'"):
+        connect("http://127.0.0.1:1", "test")

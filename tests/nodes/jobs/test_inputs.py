@@ -78,6 +78,13 @@ def test_what_names_nothing_is_refused(season, word, told):
         sources([word], OUT)
 
 
+@pytest.mark.parametrize("word", ["s", "s/*.mcap"])
+def test_inputs_that_are_the_folder_of_results_are_told(season, word):
+    """A folder was said to have no recording, and a pattern ended with 0 after no job."""
+    with pytest.raises(UserError, match=r"no recording \(.mcap\) there; what lies in s, the folder of res"):
+        sources([word], Path("s"))
+
+
 def test_a_store_is_listed_by_the_same_rules(season):
     url = f"file://{season}/s"
     found = sources([url], OUT)
