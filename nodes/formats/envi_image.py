@@ -74,6 +74,9 @@ def open_envi(path: Path) -> EnviImage:
         raise UserError(f"{header_path}: interleave: {header.get('interleave', 'missing')}, wanted bil, bip or bsq")
     if header_integer(header_path, header, "file compression", 0):
         raise UserError(f"{header_path}: file compression: {header['file compression']}, wanted 0 (plain values)")
+    for key in ("major frame offsets", "minor frame offsets"):
+        if header.get(key, "").strip("0., "):
+            raise UserError(f"{header_path}: {key}: {header[key]}, wanted 0 (no bytes between lines)")
     order = header_integer(header_path, header, "byte order", 0)
     if order > 1:
         raise UserError(f"{header_path}: byte order: {order}, wanted 0 (least byte first) or 1")

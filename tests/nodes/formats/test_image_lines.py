@@ -108,6 +108,7 @@ HEADERS = {
     "interleave": ({"interleave": "tiled"}, r"a.hdr: interleave: tiled, wanted bil, bip or bsq"),
     "byte order": ({"byte order": 2}, r"a.hdr: byte order: 2, wanted 0"),
     "compressed": ({"file compression": 1}, r"a.hdr: file compression: 1, wanted 0"),
+    "bytes between lines": ({"major frame offsets": "{16, 0}"}, r"a.hdr: major frame offsets: 16, 0, wanted 0"),
     "names": ({"band names": "{a, b}"}, r"a.hdr: band names: 2 names, wanted 3"),
 }
 
