@@ -32,6 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     if args.draws < 1:
         raise UserError(f"--draws {args.draws}: wanted at least 1")
+    if args.seed < 0:
+        raise UserError(f"--seed {args.seed}: wanted at least 0")
     if args.plot:
         refuse_unless_picture(Path(args.plot))
     rows: list[dict[str, Any]] = []

@@ -134,6 +134,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     if not 2 <= args.grid <= 200:
         raise UserError(f"--grid {args.grid}: wanted 2 to 200 columns and rows")
+    if args.seed < 0:
+        raise UserError(f"--seed {args.seed}: wanted at least 0")
     for name in (args.csv, args.map_csv, args.page):
         if name:
             refuse_unless_writable(Path(name))

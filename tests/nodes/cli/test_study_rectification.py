@@ -139,3 +139,9 @@ def test_study_of_regularisation_prints_the_published_table(tmp_path, capsys, mo
         "least squares", "fictitious observations", "Tikhonov, cross-validation", "Tikhonov, L-curve",
         "truncated, cross-validation",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("option", ["--seed", "--draws"])
+def test_draws_and_seeds_that_cannot_be(option, capsys):
+    assert main(["study", "regularisation", option, "-1"]) == 1
+    assert capsys.readouterr().err.startswith(f"triline study: {option} -1: wanted at least ")

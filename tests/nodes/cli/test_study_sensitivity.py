@@ -134,6 +134,7 @@ def test_what_reading_the_metadata_told_is_told(tmp_path, capsys):
         (["ads40", "--samples", "1000"], "ads40: 1000 samples of a Sobol sequence, wanted a power of 2"),
         (["ads40", "--runs", "3"], "ads40: 3 runs, wanted at least 100"),
         (["ads40", "--pixel", "99999", "0"], "--pixel 99999 0, wanted one of the image of 12000 columns"),
+        (["ads40", "--seed", "-1"], "triline study: --seed -1: wanted at least 0"),
         (["ads40", "--grid", "1"], "--grid 1: wanted 2 to 200 columns and rows"),
         (["ads40", "--page", "nowhere/page.html"], "nowhere/page.html: no folder nowhere"),
         (["bilsat", "--ccd", "N"], "bilsat: --ccd N, but a frame image has no lines of detectors"),
