@@ -107,11 +107,13 @@ def _check_datum(path: Path, text: Sequence[str], notes: list[str]) -> None:
     """Raise UserError for a datum or heights of another kind; a note where the file does not say."""
     said = {(i, *kind) for i, line in enumerate(text, 1) for kind in re.findall(r"^%.*height=(\w+)/(\w+)", line)}
     for number, datum, height in sorted(said):
-        if datum != "WGS84":
-            raise UserError(f"{path}:{number}: positions in the datum {datum}, wanted WGS84")
+        if datum == "Tokyo":
+            raise UserError(f"{path}:{number}: positions in the datum Tokyo, wanted WGS84")
         if height != "ellipsoidal":
-            what = f"heights above the geoid (WGS84/{height}), wanted those above the ellipsoid"
+            what = f"heights above the geoid ({datum}/{height}), wanted those above the ellipsoid"
             raise UserError(f"{path}:{number}: {what}")
+    for datum in sorted({datum for _, datum, _ in said} - {"WGS84"}):  # CGCS2000 of other programs: decimetres
+        notes.append(f"{path.name}: datum {datum}, taken as WGS 84")
     if not said:
         notes.append(f"{path.name}: heights are taken as those above the ellipsoid of WGS 84; the file does not say")
 

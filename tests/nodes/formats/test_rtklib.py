@@ -137,9 +137,11 @@ def test_fixes_at_latitude_and_longitude_zero_are_dropped(tmp_path):
     assert "a.pos: 2 fixes without a position: dropped" in imported.notes
 
 
-def test_what_a_file_does_not_say_about_heights_is_told(tmp_path):
+def test_what_a_file_does_not_say_about_heights_and_another_datum_are_told(tmp_path):
     _, notes = read(tmp_path / "a.pos", text_of().replace(HEIGHTS, ""))
     assert "a.pos: heights are taken as those above the ellipsoid of WGS 84; the file does not say" in notes
+    _, notes = read(tmp_path / "a.pos", text_of().replace("height=WGS84", "height=CGCS2000"))
+    assert "a.pos: datum CGCS2000, taken as WGS 84" in notes
 
 
 def test_positions_alone_become_fixes(tmp_path, capsys):
