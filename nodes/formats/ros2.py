@@ -40,6 +40,8 @@ FIX_SIGMA_M = (5.0, 5.0, 10.0)
 ATTITUDE_SIGMA_RAD = (0.01, 0.01, 0.03)
 #: What is counted of messages whose values nodes would refuse, as of other sensors.
 IMPOSSIBLE = "with values that no aircraft has"
+#: Of the orientation alone; a quaternion of zeros is how some say that they measure none.
+NO_ROTATION = "with an orientation whose quaternion has not the length 1"
 _FLU_FRD = np.array([1.0, -1.0, -1.0])
 _DIAGONAL = [0, 4, 8]
 #: Inertial samples that are converted at once.
@@ -207,7 +209,9 @@ def inertial_messages(
         force_variance = np.array([s.linear_acceleration_covariance for s in read])[:, _DIAGONAL]
         rate_variance = np.array([s.angular_velocity_covariance for s in read])[:, _DIAGONAL]
         measured = (force_variance[:, 0] != -1) & (rate_variance[:, 0] != -1)
-        angles, sigma, oriented, assumed = _attitudes(read)
+        angles, sigma, oriented, assumed, bent = _attitudes(read)
+        if bent:
+            left_out[NO_ROTATION] += bent
         columns = (force, rate, _sigma(force_variance), _sigma(rate_variance))
         for k, (time, interval, f, w, force_sigma, rate_sigma) in enumerate(
             zip(time_ns, interval_ns, *(column.tolist() for column in columns), strict=True)
@@ -245,18 +249,20 @@ def _interval_ns(step_ns: int, steps: deque[int]) -> int:
     return round(sum(usual) / len(usual)) if usual and step_ns > GAP_FACTOR * usual[-1] else step_ns
 
 
-def _attitudes(samples: list[Any]) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Roll, pitch, heading (n, 3) and their sigmas (n, 3), rad; which samples have them; which sigmas are assumed."""
+def _attitudes(samples: list[Any]) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_], int]:
+    """Roll, pitch, heading (n, 3) and their sigmas (n, 3), rad; which samples have them; which sigmas are assumed;
+    and of how many samples the quaternion is no rotation."""
     q = np.array([(v.x, v.y, v.z, v.w) for v in (s.orientation for s in samples)])
     variance = np.array([s.orientation_covariance for s in samples])[:, _DIAGONAL]
     with np.errstate(over="ignore"):
         length = np.linalg.norm(q, axis=1)
-    oriented = (variance[:, 0] != -1) & (np.abs(length - 1.0) < 1e-3)
+    stated = (variance[:, 0] != -1) & (length != 0.0)
+    oriented = stated & (np.abs(length - 1.0) < 1e-3)
     q[~oriented] = 0.0, 0.0, 0.0, 1.0
     R_nb = R_ENU_NED.T @ matrix_from_quaternion(q) * _FLU_FRD
     known = np.all((variance > 0) & np.isfinite(variance), axis=1)
     sigma = np.where(known[:, None], np.sqrt(np.where(known[:, None], variance, 0.0)), ATTITUDE_SIGMA_RAD)
-    return navigation_from_matrix(R_nb), sigma, oriented, oriented & ~known
+    return navigation_from_matrix(R_nb), sigma, oriented, oriented & ~known, int((stated & ~oriented).sum())
 
 
 def _passes(check: Callable[..., None], *values: Any) -> bool:

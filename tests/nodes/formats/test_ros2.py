@@ -192,6 +192,19 @@ def test_numbers_of_no_orientation_and_no_noise_are_left_out_without_a_warning(t
         found = by_topic(list(imported.messages))
     assert [x.stamp_ns for x in found["sensor/attitude"]] == [START_NS + STEP_NS]
     assert found["sensor/imu"][0].body.rate_sigma == 0.0
+    assert "/imu: messages left out: 1 with an orientation whose quaternion has not the length 1" in imported.notes
+
+
+def test_a_quaternion_of_zeros_is_no_orientation(tmp_path):
+    """That of a sensor which measures none is nothing to tell; one of another length was left out as silently."""
+    samples = [imu(START_NS + i * STEP_NS) for i in range(4)]
+    for i, length in enumerate((0.0, 0.998, 0.998)):
+        q = samples[i].orientation
+        q.z, q.w = length * q.z, length * q.w
+    imported = read_any(write_bag(tmp_path / "bag", [("/imu", s.header.stamp.nanosec, s) for s in samples]))
+    found = by_topic(list(imported.messages))
+    assert len(found["sensor/attitude"]) == 1 and len(found["sensor/imu"]) == 4
+    assert "/imu: messages left out: 2 with an orientation whose quaternion has not the length 1" in imported.notes
 
 
 def test_values_that_no_aircraft_has_are_left_out_as_of_other_sensors(tmp_path):
