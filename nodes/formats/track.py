@@ -165,9 +165,9 @@ def checked(track: NavigationTrack, path: Path, rows: NDArray[np.intp] | None = 
     if rising.sum() < 2:
         raise UserError(f"{path}: {int(rising.sum())} poses with rising time, wanted at least 2")
     if rising.all():
-        return _with_jumps(track, path)
+        return _with_jumps(track, path, number)
     note = f"{path.name}: {int((~rising).sum())} poses do not come after the one before them and were left out"
-    return _with_jumps(_part(track, rising, note), path)
+    return _with_jumps(_part(track, rising, note), path, number[rising])
 
 
 def _part(track: NavigationTrack, which: NDArray[np.bool_], note: str) -> NavigationTrack:
@@ -179,8 +179,11 @@ def _part(track: NavigationTrack, which: NDArray[np.bool_], note: str) -> Naviga
     return replace(track, **parts, notes=(*track.notes, note))
 
 
-def _with_jumps(track: NavigationTrack, path: Path) -> NavigationTrack:
-    """The track with a note about steps of the position that no aircraft can fly, given the velocity before them."""
+def _with_jumps(track: NavigationTrack, path: Path, number: NDArray[np.intp]) -> NavigationTrack:
+    """The track with a note about steps of the position that no aircraft can fly, given the velocity before them.
+
+    ``number`` (n,) is that of each pose's record in the file, from 1.
+    """
     lat, lon, height = track.geodetic.T
     position = ecef_from_geodetic(np.radians(lat), np.radians(lon), height)
     step_s = np.diff(track.time_ns) * 1e-9
@@ -192,7 +195,8 @@ def _with_jumps(track: NavigationTrack, path: Path) -> NavigationTrack:
     if not len(bad):
         return track
     first = bad[np.concatenate([[True], np.diff(bad) > 3])]
-    note = f"position jumps at {len(first)} places, by {off[bad].max():.1f} m at most, first at record {first[0] + 3}"
+    record = number[first[0] + 2]
+    note = f"position jumps at {len(first)} places, by {off[bad].max():.1f} m at most, first at record {record}"
     return replace(track, notes=(*track.notes, f"{path.name}: {note}"))
 
 

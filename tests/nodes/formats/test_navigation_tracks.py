@@ -192,12 +192,13 @@ def test_a_gap_between_strips_is_no_jump(tmp_path, gap_s, jump_m, told):
 
 def test_poses_of_a_receiver_without_a_fix_are_left_out(tmp_path):
     """At latitude 0, longitude 0 they put the origin of the local frame half way to the Gulf of Guinea."""
-    path, rows = tmp_path / "two.csv", two_strips(0.1).splitlines()
+    path, rows = tmp_path / "two.csv", two_strips(120.0, 5.0).splitlines()
     zero = [re.sub(r",48[.]\d+,9[.]\d+,", ",0,0,", row) for row in rows[1:4]]
     path.write_text("\n".join([rows[0], *zero, *rows[4:]]) + "\n")
     track = read_trajectory_csv(path)
     assert len(track) == 197 and track.geodetic[0, 0] == 48.0
     assert "two.csv: 3 poses at latitude 0, longitude 0 (no fix) were left out" in track.notes
+    assert "two.csv: position jumps at 1 places, by 5.0 m at most, first at record 151" in track.notes
     path.write_text(path.read_text().replace(rows[9], rows[9].replace(",48.", ",148.")))
     with pytest.raises(UserError, match=r"record 9: latitude: 148, wanted"):
         read_trajectory_csv(path)
