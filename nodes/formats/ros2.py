@@ -40,7 +40,8 @@ FIX_SIGMA_M = (5.0, 5.0, 10.0)
 ATTITUDE_SIGMA_RAD = (0.01, 0.01, 0.03)
 #: What is counted of messages whose values nodes would refuse, as of other sensors.
 IMPOSSIBLE = "with values that no aircraft has"
-#: Of the orientation alone; a quaternion of zeros is how some say that they measure none.
+#: Of the orientation alone; a quaternion of zeros, or the one that a message begins with, without a covariance, is how
+#: some say that they measure none.
 NO_ROTATION = "with an orientation whose quaternion has not the length 1"
 _FLU_FRD = np.array([1.0, -1.0, -1.0])
 _DIAGONAL = [0, 4, 8]
@@ -256,7 +257,8 @@ def _attitudes(samples: list[Any]) -> tuple[Array, Array, NDArray[np.bool_], NDA
     variance = np.array([s.orientation_covariance for s in samples])[:, _DIAGONAL]
     with np.errstate(over="ignore"):
         length = np.linalg.norm(q, axis=1)
-    stated = (variance[:, 0] != -1) & (length != 0.0)
+    untouched = (q == [0.0, 0.0, 0.0, 1.0]).all(axis=1) & (variance == 0.0).all(axis=1)  # as a message begins
+    stated = (variance[:, 0] != -1) & (length != 0.0) & ~untouched
     oriented = stated & (np.abs(length - 1.0) < 1e-3)
     q[~oriented] = 0.0, 0.0, 0.0, 1.0
     R_nb = R_ENU_NED.T @ matrix_from_quaternion(q) * _FLU_FRD

@@ -196,14 +196,16 @@ def test_numbers_of_no_orientation_and_no_noise_are_left_out_without_a_warning(t
 
 
 def test_a_quaternion_of_zeros_is_no_orientation(tmp_path):
-    """That of a sensor which measures none is nothing to tell; one of another length was left out as silently."""
-    samples = [imu(START_NS + i * STEP_NS) for i in range(4)]
+    """That of a sensor which measures none is nothing to tell; one of another length was left out as silently, and the
+    one that a message begins with was an aircraft that flies east."""
+    samples = [imu(START_NS + i * STEP_NS, covariance_known=i < 4) for i in range(5)]
+    samples[4].orientation.z, samples[4].orientation.w = 0.0, 1.0
     for i, length in enumerate((0.0, 0.998, 0.998)):
         q = samples[i].orientation
         q.z, q.w = length * q.z, length * q.w
     imported = read_any(write_bag(tmp_path / "bag", [("/imu", s.header.stamp.nanosec, s) for s in samples]))
     found = by_topic(list(imported.messages))
-    assert len(found["sensor/attitude"]) == 1 and len(found["sensor/imu"]) == 4
+    assert len(found["sensor/attitude"]) == 1 and len(found["sensor/imu"]) == 5
     assert "/imu: messages left out: 2 with an orientation whose quaternion has not the length 1" in imported.notes
 
 
