@@ -29,7 +29,7 @@ from .gps_time import GPS_EPOCH_S, WEEK_S
 from .gpx import has_attitudes, is_gpx, position_messages, read_gpx, read_positions
 from .ground_height import NOT_GIVEN, GroundGiven
 from .image_lines import ImageStrip, LinesGiven, open_strip, with_lines
-from .other_kinds import other_kind
+from .other_kinds import PARTS, other_kind
 from .pos_export import is_pos_export, read_pos_export
 from .ros2 import ros2_messages
 from .ros2_images import ImageTopics
@@ -177,7 +177,7 @@ def kind_of_path(path: Path) -> str:
         return "sbet"
     if is_envi_image(path) or is_tiff(path):
         return "lines"
-    if path.suffix.lower() == ".csv":  # its reader names the columns that are missing
+    if path.suffix.lower() == ".csv" and path.name not in PARTS:  # its reader names the columns that are missing
         return "csv"
     if other := other_kind(path):
         raise UserError(f"{path}: {other}")

@@ -9,11 +9,17 @@ from .frame_json import is_frame_json
 
 #: Bytes of a file that are looked at.
 _HEAD = 1 << 16
-#: Files of settings -> whose they are.
-_SETTINGS = {
+#: Files of folders -> what they are.
+PARTS = {
     "flight.toml": "settings of a flight folder",
     "project.toml": "settings of a block folder",
     "platform.toml": "settings of a sensor folder",
+    "imu.csv": "inertial samples of a sensor folder",
+    "gnss.csv": "fixes of a sensor folder",
+    "attitude.csv": "attitudes of a sensor folder",
+    "strips.csv": "strips of a block folder",
+    "ground_points.csv": "known points of a block folder",
+    "image_points.csv": "image points of a block folder",
 }
 #: How compressed files begin -> their name.
 _PACKED = {
@@ -43,8 +49,8 @@ def other_kind(path: Path) -> str | None:
         return _scene("rational polynomials of a satellite scene")
     if b"dimap_document" in head[:512].lower():
         return _scene("metadata of a satellite scene")
-    if name in _SETTINGS:
-        return f"{_SETTINGS[name]}, which is given as a whole"
+    if name in PARTS:
+        return f"{PARTS[name]}, which is given as a whole"
     return None
 
 

@@ -67,6 +67,7 @@ FILES = {
     "flight.mcap.gz": ("\x1f\x8b", "packed (gzip), which has to be unpacked first"),
     "flight.zip": ("PK\x03\x04", "packed (ZIP), which has to be unpacked first"),
     "flight.toml": ("[flight]\n", "settings of a flight folder, which is given as a whole"),
+    "imu.csv": ("time_s,interval_s,force_x_m_s2\n", "inertial samples of a sensor folder, which is given as a whole"),
 }
 
 
