@@ -553,4 +553,4 @@ class Window:
         times = np.array([min(self._now_s, strip.end_s, self.trajectory.end_s)])
         if not np.isfinite(times[0]) or not self.trajectory.covers(times)[0]:
             return np.zeros((6, 6))
-        return self._orientation.noise(strip, times)[0] + of_vibration(self.network.pose_noise.possible_vibration)
+        return self._orientation.noise(strip, times)[0] + of_vibration(self.network.vibrations.since(times))[0]

@@ -8,10 +8,13 @@ from ...arrays import Array
 
 
 class LargestSince:
-    """The largest of some values that were noted at a time or later."""
+    """The largest value that was noted at a time or later.
+
+    A value is forgotten as soon as one is noted that is as large, so that those that are kept fall with time.
+    """
 
     def __init__(self) -> None:
-        self._times_s: list[float] = []  # in order; values fall, each is the largest from the time before it on
+        self._times_s: list[float] = []
         self._values: list[float] = []
 
     def note(self, now_s: float, value: float) -> None:
@@ -23,7 +26,7 @@ class LargestSince:
         self._values.append(value)
 
     def at(self, time_s: Array) -> Array:
-        """Values (n,) at times (n,): after the last one that one, 0 where there is none."""
+        """For times (n,) the largest (n,) since then; the newest one for later times, 0 before any was noted."""
         if not self._values:
             return np.zeros(np.shape(time_s))
         place = np.searchsorted(self._times_s, time_s)
