@@ -109,7 +109,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     images.add_argument("--strip", metavar="ID", help="of the images (default: name of the first file)")
     images.add_argument(
-        "--line-times", type=Path, metavar="CSV", help="time of each line: line, and time, time_s or gps_s"
+        "--line-times", type=Path, metavar="FILE", help="CSV: line, and time, time_s or gps_s; Resonon; Headwall"
     )
     images.add_argument("--first-time", metavar="ISO", help="time of line 0 (UTC), with --line-rate")
     images.add_argument("--band", metavar="BAND", help="number from 1, name, or weighted sum: 2:0.5,3:0.5")

@@ -37,6 +37,7 @@ from .geocal_xml import read_glas_camera
 from .ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
 from .image_lines import ImageStrip, LinesGiven, open_strip
 from .keys import Keys, is_there, read_toml
+from .line_time_files import times_beside
 from .new_file import new_file
 from .projection import missing_grids, off_without_grids, unknown_heights, with_heights
 from .sensor_folder import SensorFolder, read_grade, read_sensor_folder, refuse_mounting
@@ -768,7 +769,8 @@ def _strip(flight: Flight, keys: Keys) -> None:
         raise keys.refuse("type", f"one of {', '.join(TYPES)}")
     given = LinesGiven(tuple(files), id, times, first, band, pair, flight.day, raw)
     track = flight.track
-    if times is None and first is None and (track is None or track.line_rate_hz <= 0):
+    beside = times_beside(files[0][1])
+    if times is None and first is None and beside is None and (track is None or track.line_rate_hz <= 0):
         raise UserError(
             f"{keys.path}: {keys.where}: times of the lines missing, wanted line_times, or first_time and line_rate_hz"
         )

@@ -22,9 +22,9 @@ from ..node import Message
 from .envi import header_of
 from .envi_image import TYPES, open_envi, open_raw
 from .grey_image import GreyImage, ImageFile
-from .table import Column, column_names_of, read_table, separator_hint
+from .line_time_files import line_times, times_beside
 from .tiff_image import is_tiff, open_tiff
-from .time_columns import WANTED, instant_ns, time_columns, times_of
+from .time_columns import instant_ns
 
 #: Length of a block, s, and the most bytes that it has.
 BLOCK_S = 0.1
@@ -41,7 +41,7 @@ class LinesGiven:
     ----------
     files : (id of the CCD line or "", image, band or None), one a view
     strip : id of the strip; the name of the first file where it is empty
-    times : CSV with the time of each line, or None
+    times : file with the time of each line, or None for one beside the image, or the times of poses
     first : time of line 0 in ISO 8601, and lines a second; None with ``times``
     band : of files that name none
     span : values that become black and white
@@ -287,8 +287,9 @@ def _times(
             raise UserError(f"--line-rate {rate:g}, wanted more than 0 Hz")
         start = instant_ns(text, "--first-time")
         return start + np.rint(np.arange(lines) * (1e9 / rate)).astype(np.int64), True
-    if given.times is not None:
-        time_ns, source = line_times(given.times, given.day, notes), str(given.times)
+    times = given.times or times_beside(path)
+    if times is not None:
+        time_ns, source = line_times(times, given.day, notes), str(times)
     elif pose_times_ns is not None:
         time_ns, source = pose_times_ns, "the file of poses, one a line,"
     else:
@@ -298,25 +299,3 @@ def _times(
     if len(time_ns) != lines:
         raise UserError(f"{path}: {lines} lines, but {source} has the times of {len(time_ns)}")
     return time_ns, False
-
-
-def line_times(path: Path, day: date | None, notes: list[str]) -> NDArray[np.int64]:
-    """UTC (n,) in ns since the Unix epoch of the lines 0, 1, 2 ... in a CSV ``line,time`` (ISO 8601, seconds, GPS).
-
-    Raises
-    ------
-    UserError : a column that is missing, a line that is missing, a time that does not come after the one before
-    """
-    if not path.is_file():
-        raise UserError(f"{path}: no such file, wanted a CSV with line and time")
-    header = column_names_of(path)
-    columns = time_columns(header)
-    if not columns:
-        raise UserError(f"{path}:1: time: column missing, wanted line and {WANTED}{separator_hint(header)}")
-    table = read_table(path, [Column("line", "integer", low=0), *columns], notes)
-    line = table["line"]
-    table.refuse(line != np.arange(len(line)), "line", lambda i: f"{line[i]:.0f}, wanted {i} (0, 1, 2, ...)")
-    time_ns = times_of(table, columns, day, notes)
-    late = np.concatenate([[False], np.diff(time_ns) <= 0])
-    table.refuse(late, columns[0].name, lambda i: "does not come after the line before it")
-    return time_ns

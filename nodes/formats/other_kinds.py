@@ -6,6 +6,7 @@ from pathlib import Path
 
 from .byte_order_mark import without_mark
 from .frame_json import is_frame_json
+from .line_time_files import is_frame_index
 
 #: Bytes of a file that are looked at.
 _HEAD = 1 << 16
@@ -49,6 +50,8 @@ def other_kind(path: Path) -> str | None:
         return _scene("rational polynomials of a satellite scene")
     if b"dimap_document" in head[:512].lower():
         return _scene("metadata of a satellite scene")
+    if suffix == ".times" or is_frame_index(path):
+        return "times of image lines, which `triline import` finds beside their image, or takes by --line-times"
     if name in PARTS:
         return f"{PARTS[name]}, which is given as a whole"
     return None

@@ -20,6 +20,7 @@ from .track import NavigationTrack, checked
 
 _HEADWALL = ("Roll", "Pitch", "Yaw", "Lat", "Lon", "Alt")
 _HEADWALL_TIME = "Gps_UTC_Date&Time"
+_HEADWALL_CLOCK = "Timestamp"
 _LCF = ("time", "roll", "pitch", "yaw", "longitude", "latitude", "altitude")
 
 
@@ -45,13 +46,37 @@ def read_headwall(path: Path, day: date | None = None) -> NavigationTrack:
     ------
     UserError : a column that is missing, a value that is malformed (with its line), another day
     """
-    lines = [(i, text.split("\t")) for i, text in _lines(path)]
+    values, time_ns, keep = _headwall(path, _HEADWALL)
+    same_day(path, int(time_ns[0]), day)
+    notes = (f"{path.name}: Alt is taken as height above the ellipsoid (WGS 84)",)
+    if not keep.all():
+        notes += (f"{path.name}: {int((~keep).sum())} poses repeat the time of the one before them and were left out",)
+    rpy = np.radians(values[keep, :3])
+    track = NavigationTrack(path.stem, time_ns[keep], values[keep, 3:], rpy, notes=notes)
+    return check_units(checked(track, path), path, {"lat": "Lat", "lon": "Lon", "heading": "Yaw"})
+
+
+def headwall_clock(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Readings (n,) of the clock ``Timestamp`` of an ``imu_gps.txt``, rising, and their UTC (n,), ns.
+
+    Raises
+    ------
+    UserError : a column that is missing, a value that is malformed (with its line)
+    """
+    values, time_ns, keep = _headwall(path, (_HEADWALL_CLOCK,))
+    clock, first = np.unique(values[keep, 0], return_index=True)
+    return clock, time_ns[keep][first]
+
+
+def _headwall(path: Path, columns: tuple[str, ...]) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Columns (n, columns) of an ``imu_gps.txt``, the UTC (n,) of its rows, ns, and which do not repeat that before."""
+    lines = [(i, text.split("\t")) for i, text in numbered_lines(path)]
     names = [name.strip() for name in lines[0][1]] if lines else []
-    for name in (*_HEADWALL, _HEADWALL_TIME):
+    for name in (*columns, _HEADWALL_TIME):
         if name not in names:
-            wanted = ", ".join((*_HEADWALL, _HEADWALL_TIME))
+            wanted = ", ".join((*columns, _HEADWALL_TIME))
             raise UserError(f"{path}:1: {name}: column missing, wanted {wanted}, between tabs")
-    values = _numbers(path, lines[1:], {name: names.index(name) for name in _HEADWALL})
+    values = numbers_of(path, lines[1:], {name: names.index(name) for name in columns})
     place = names.index(_HEADWALL_TIME)
     words = [fields[place].strip() if place < len(fields) else "" for _, fields in lines[1:]]
     time_ns, bad = _utc_ns(words)
@@ -59,14 +84,7 @@ def read_headwall(path: Path, day: date | None = None) -> NavigationTrack:
         where = f"{path}:{lines[1 + bad[0]][0]}: {_HEADWALL_TIME}"
         problem = f"{where}: {words[bad[0]]!r}, wanted a UTC time as 2018/08/28 19:34:25.05"
         raise UserError(one_line([problem], len(bad) - 1))
-    same_day(path, int(time_ns[0]), day)
-    keep = np.concatenate([[True], np.diff(time_ns) != 0])
-    notes = (f"{path.name}: Alt is taken as height above the ellipsoid (WGS 84)",)
-    if not keep.all():
-        notes += (f"{path.name}: {int((~keep).sum())} poses repeat the time of the one before them and were left out",)
-    rpy = np.radians(values[keep, :3])
-    track = NavigationTrack(path.stem, time_ns[keep], values[keep, 3:], rpy, notes=notes)
-    return check_units(checked(track, path), path, {"lat": "Lat", "lon": "Lon", "heading": "Yaw"})
+    return values, time_ns, np.concatenate([[True], np.diff(time_ns) != 0])
 
 
 def read_resonon(path: Path, day: date | None = None) -> NavigationTrack:
@@ -80,11 +98,11 @@ def read_resonon(path: Path, day: date | None = None) -> NavigationTrack:
     ------
     UserError : a value that is missing or malformed (with its line), degrees where radians are wanted, another day
     """
-    every = [(i, text.split()) for i, text in _lines(path) if not text.startswith("#")]
+    every = [(i, text.split()) for i, text in numbered_lines(path) if not text.startswith("#")]
     rows = np.array([k for k, (_, fields) in enumerate(every) if fields[9:10] != ["0"]], dtype=np.intp)
     rows = rows if len(rows) else np.arange(len(every))  # of a program that does not know this column
     lines = [every[k] for k in rows]
-    values = _numbers(path, lines, {name: i for i, name in enumerate(_LCF)})
+    values = numbers_of(path, lines, {name: i for i, name in enumerate(_LCF)})
     angles = np.abs(values[:, 1:4])
     bad = np.argwhere(angles > 2 * np.pi + 1e-3)
     if len(bad):
@@ -93,16 +111,7 @@ def read_resonon(path: Path, day: date | None = None) -> NavigationTrack:
         raise UserError(
             one_line([f"{where}: {values[row, 1 + column]:g}, wanted radians; are they degrees?"], len(bad) - 1)
         )
-    seconds = values[:, 0]
-    bad = np.flatnonzero(~((seconds >= 0.0) & (seconds < LATEST_S - GPS_EPOCH_S)))
-    if len(bad):
-        what = f"{path}:{lines[bad[0]][0]}: {_LCF[0]}: {seconds[bad[0]]:.6g}, wanted GPS seconds since 1980-01-06"
-        raise UserError(one_line([what], len(bad) - 1))
-    time_ns, scale = utc_ns_from_gps(0, seconds), "GPS seconds since 1980-01-06"
-    since_1970_ns = np.rint(seconds * 1e6).astype(np.int64) * 1000
-    if day is not None and not is_same_day(int(time_ns[0]), day) and is_same_day(int(since_1970_ns[0]), day):
-        time_ns, scale = since_1970_ns, "seconds since 1970-01-01 (UTC)"
-    same_day(path, int(time_ns[0]), day)
+    time_ns, scale = _resonon_utc_ns(path, lines, values[:, 0], day)
     begin = np.datetime64(int(time_ns[0]), "ns").astype("datetime64[s]")
     notes = (
         f"{path.name}: times are taken as {scale}: the flight begins at {begin}Z",
@@ -113,6 +122,34 @@ def read_resonon(path: Path, day: date | None = None) -> NavigationTrack:
     rpy = values[:, 1:4] * [-1.0, 1.0, 1.0]
     track = NavigationTrack(path.stem, time_ns, values[:, [5, 4, 6]], rpy, notes=notes)
     return check_units(checked(track, path, rows), path, {"lat": "latitude", "lon": "longitude", "heading": "yaw"})
+
+
+def resonon_first_ns(path: Path, day: date | None = None) -> int:
+    """UTC of the first pose of an ``.lcf``, whether it is to be used or not, in ns since the Unix epoch.
+
+    Raises
+    ------
+    UserError : a time that is missing or malformed, another day
+    """
+    lines = [(i, text.split()) for i, text in numbered_lines(path) if not text.startswith("#")]
+    seconds = numbers_of(path, lines, {_LCF[0]: 0})[:, 0]
+    return int(_resonon_utc_ns(path, lines, seconds, day)[0][0])
+
+
+def _resonon_utc_ns(
+    path: Path, lines: list[tuple[int, list[str]]], seconds: NDArray[np.float64], day: date | None
+) -> tuple[NDArray[np.int64], str]:
+    """UTC (n,), ns, of the times of an ``.lcf``, and since when they count."""
+    bad = np.flatnonzero(~((seconds >= 0.0) & (seconds < LATEST_S - GPS_EPOCH_S)))
+    if len(bad):
+        what = f"{path}:{lines[bad[0]][0]}: {_LCF[0]}: {seconds[bad[0]]:.6g}, wanted GPS seconds since 1980-01-06"
+        raise UserError(one_line([what], len(bad) - 1))
+    time_ns, scale = utc_ns_from_gps(0, seconds), "GPS seconds since 1980-01-06"
+    since_1970_ns = np.rint(seconds * 1e6).astype(np.int64) * 1000
+    if day is not None and not is_same_day(int(time_ns[0]), day) and is_same_day(int(since_1970_ns[0]), day):
+        time_ns, scale = since_1970_ns, "seconds since 1970-01-01 (UTC)"
+    same_day(path, int(time_ns[0]), day)
+    return time_ns, scale
 
 
 def _utc_ns(words: list[str]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
@@ -128,13 +165,13 @@ def _utc_ns(words: list[str]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
     return instants.astype(np.int64) + fraction_ns, np.flatnonzero(np.isnat(instants) | ~digits)
 
 
-def _lines(path: Path) -> list[tuple[int, str]]:
+def numbered_lines(path: Path) -> list[tuple[int, str]]:
     """Number and text of the lines that are not blank."""
     text = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     return [(i, line) for i, line in enumerate(text, 1) if line.strip()]
 
 
-def _numbers(path: Path, lines: list[tuple[int, list[str]]], place: dict[str, int]) -> NDArray[np.float64]:
+def numbers_of(path: Path, lines: list[tuple[int, list[str]]], place: dict[str, int]) -> NDArray[np.float64]:
     """Values (n, columns) of the columns at their places."""
     rows, problems = [], []
     for number, fields in lines:
@@ -153,5 +190,5 @@ def _numbers(path: Path, lines: list[tuple[int, list[str]]], place: dict[str, in
     if problems:
         raise UserError(one_line(problems))
     if len(rows) < 2:
-        raise UserError(f"{path}: {len(rows)} poses, wanted at least 2")
+        raise UserError(f"{path}: {len(rows)} rows, wanted at least 2")
     return np.array(rows)

@@ -426,7 +426,7 @@ def test_headwall_damaged(tmp_path):
             None,
             r"imu_gps.txt:5: Gps_UTC_Date&Time: '2020/06/01 12:00:03.\u00b2",
         ),
-        (HEADWALL + "\n" + rows[0], None, r"imu_gps.txt: 1 poses, wanted at least 2"),
+        (HEADWALL + "\n" + rows[0], None, r"imu_gps.txt: 1 rows, wanted at least 2"),
     ):
         path.write_text(text + "\n")
         with pytest.raises(UserError, match=wanted):
