@@ -18,6 +18,8 @@ from .vendor_poses import headwall_clock, numbered_lines, numbers_of, resonon_fi
 _AROUND = 200
 #: So far a reading may be off a clock that runs evenly, s.
 _UNEVEN_S = 0.1
+#: Lines of one image are taken within a day, s.
+_LONGEST_S = 86400.0
 #: A scatter of readings that is worth a remark, s.
 _SCATTER_S = 1e-3
 
@@ -86,6 +88,10 @@ def resonon_line_times(path: Path, day: date | None, notes: list[str]) -> NDArra
     lines = [(number, text.split()) for number, text in numbered_lines(path)]
     seconds = numbers_of(path, lines, {"time": 0})[:, 0]
     _refuse_late(path, [number for number, _ in lines], np.diff(seconds) <= 0)
+    if seconds[-1] - seconds[0] > _LONGEST_S:
+        raise UserError(
+            f"{path}: {seconds[-1] - seconds[0]:.3g} s from the first to the last line, wanted less than a day"
+        )
     notes.append(f"{path.name}: the first line is taken with the first pose of {poses[0].name}")
     return resonon_first_ns(poses[0], day) + np.rint((seconds - seconds[0]) * 1e9).astype(np.int64)
 

@@ -317,8 +317,8 @@ def _header(path: Path, columns: Sequence[Column], notes: list[str]) -> list[str
 
 def separator_hint(header: Sequence[str]) -> str:
     """What may be wrong with a header in which a column is missing; "" where that is nothing else."""
-    if len(header) == 1:
-        return "; is the separator a comma?" if any(c in header[0] for c in "\t ") else ""
+    if len(header) < 2:
+        return "; is the separator a comma?" if any(c in name for name in header for c in "\t ") else ""
     capitals = all(name.isupper() for name in header)
     return f"; capital letters count: {header[0]} stands there" if capitals else ""
 

@@ -42,6 +42,7 @@ from small_block import FILES, write_files
 from test_damaged_files import small_files
 from test_image_lines import cube_of, write_tiff
 from test_imports import write_sbet_file
+from test_line_time_files import headwall, resonon
 from test_pose_tables import HEADWALL, headwall_rows, lcf_rows
 from test_ros2 import flight_of, write_bag
 from test_rtklib import text_of as rtklib_positions
@@ -59,6 +60,7 @@ from triline.nodes.formats.geotiff import MOST_HEIGHTS, Heights, write_heights
 from triline.nodes.formats.grey_image import ImageFile
 from triline.nodes.formats.height_raster import HeightRaster
 from triline.nodes.formats.keys import Keys
+from triline.nodes.formats.line_time_files import line_times
 from triline.nodes.formats.satellite.earth_orientation_file import read_c04, read_finals
 from triline.nodes.formats.satellite.read import read_scene
 from triline.nodes.formats.satellite.rpc_files import rasterio_rpc, read_rpc_tags, write_rpb, write_rpc_text
@@ -496,6 +498,11 @@ def file_targets(folder: Path) -> list[FileTarget]:
             (small / name).write_bytes(others[name])
             read = partial(read_glas_camera if words == "GLAS camera" else _read_all, small / name)
             whole(words, small / name, read)
+    for name, write in (("Resonon line times", resonon), ("Headwall line times", headwall)):
+        beside = folder / name
+        beside.mkdir()
+        times = write(beside)
+        whole(name, times, partial(line_times, times, None, []))
     tiff = write_tiff(folder / "lines.tif", cube_of("u2"), compress="deflate")
     whole("TIFF lines", tiff, partial(_all_lines, open_tiff, tiff))
     image = write_image(folder / "lines.img", cube_of("u2"))

@@ -296,6 +296,7 @@ def test_lines_that_do_not_fit(tmp_path, capsys):
     (tmp_path / "word.csv").write_text("line,time\n0,noon\n1,2020-06-01T12:00:01\n")
     (tmp_path / "number.csv").write_text("line,time\n0,100.5\n1,101.5\n")
     (tmp_path / "back.csv").write_text("line,time_s\n0,100.5\n1,100.5\n")
+    (tmp_path / "empty.csv").write_text("")
     (tmp_path / "none.csv").write_text("line,when\n0,100.5\n")
     rate = ["--line-rate", "100"]
     for arguments, wanted in (
@@ -322,6 +323,7 @@ def test_lines_that_do_not_fit(tmp_path, capsys):
             ["--lines", f"F={image}", "--line-times", str(tmp_path / "back.csv")],
             "back.csv:3: time_s: does not come after",
         ),
+        (["--lines", f"F={image}", "--line-times", str(tmp_path / "empty.csv")], "empty.csv:1: time: column missing"),
         (["--lines", f"F={image}", "--line-times", str(tmp_path / "none.csv")], "none.csv:1: time: column missing"),
         (["--line-times", times], "--line-times is of images, wanted --lines VIEW=FILE with it"),
         (["--lines", f"F={image}", "--grey-range", "5", "5", "--line-times", times], "--grey-range 5 5, wanted two"),

@@ -69,6 +69,7 @@ def test_resonon_times_that_cannot_be(tmp_path):
     rows = times.read_text().splitlines()
     for text, wanted in (
         ([*rows[:3], rows[2], *rows[4:]], r"L_1.bil.times:4: does not come after the line before it"),
+        ([*rows[:-1], "9" * 40], r"L_1.bil.times: 1e\+40 s from the first to the last line, wanted less than a day"),
         ([*rows[:3], "now", *rows[4:]], r"L_1.bil.times:4: time: 'now' is not a number"),
     ):
         times.write_text("\n".join(text))
