@@ -28,7 +28,7 @@ from .geocal_xml import kind_of, read_tie_points
 from .gps_time import GPS_EPOCH_S, WEEK_S
 from .gpx import has_attitudes, is_gpx, position_messages, read_gpx, read_positions
 from .ground_height import NOT_GIVEN, GroundGiven
-from .image_lines import ImageStrip, LinesGiven, open_strip, with_lines
+from .image_lines import ImageStrip, LinesGiven, open_strips, with_lines
 from .other_kinds import PARTS, other_kind
 from .pos_export import is_pos_export, read_pos_export
 from .ros2 import ros2_messages
@@ -253,10 +253,10 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
             messages = _at_height(path, kind, messages, options, notes, folder)
         given = options.lines
         files = given is not None and given.files and (topics is None or given.topics is None)
-        strip = _strip_of(options, given) if files and given is not None else None
-        if strip is not None:
+        strips = open_strips(given, options.camera) if files and given is not None else []
+        if strips:
             span = sensor_span(path, kind, options) if folder is None else sensor_extent(folder)[0]
-            strip = strip if span is None else within(strip, *span, "sensors")
+            strips = strips if span is None else within(strips, *span, "sensors")
     else:
         track = read_track(path, kind, options)
         notes.extend(track.notes)
@@ -266,18 +266,18 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
         if usual_s > POSE_GAP_S:
             what = f"more than {POSE_GAP_S:g} s between two are a gap without orientation for 'process'"
             notes.append(f"{path.name}: poses are {usual_s:.3g} s apart: {what}")
-        strip = None
+        strips = []
         if options.lines is not None:  # the images are the strip, not the poses
-            strip = _strip_of(options, options.lines, track if track.line_rate_hz > 0 else None)
-            strip = within(strip, int(track.time_ns[0]), int(track.time_ns[-1]), "poses")
-        if strip is not None or options.poses_only:
+            strips = open_strips(options.lines, options.camera, track.time_ns if track.line_rate_hz > 0 else None)
+            strips = within(strips, int(track.time_ns[0]), int(track.time_ns[-1]), "poses")
+        if strips or options.poses_only:
             track = replace(track, line_rate_hz=0.0)
         frame = replace(frame_of(track), height_m=options.ground.height(path, track.geodetic, notes))
         messages = track_messages(track, "import", options.mounting, frame, options.accuracy)
     messages = _with_camera(messages, options.camera)
-    if strip is not None:
-        notes.extend(strip.notes)
-        messages = with_lines(messages, strip, notes)
+    if strips:
+        notes.extend(note for strip in strips for note in strip.notes)
+        messages = with_lines(messages, strips, notes)
     return Imported(kind, messages, notes)
 
 
@@ -313,10 +313,6 @@ def _image_topics(options: Options) -> ImageTopics:
     return ImageTopics(lines.topics, options.camera, lines.rate_hz, lines.strip)
 
 
-def _strip_of(options: Options, lines: LinesGiven, track: NavigationTrack | None = None) -> ImageStrip:
-    return open_strip(lines, options.camera, None if track is None else track.time_ns)
-
-
 def image_alone(path: Path, lines: LinesGiven | None) -> LinesGiven:
     """What is said of images, where the input is one of them.
 
@@ -338,12 +334,13 @@ def image_alone(path: Path, lines: LinesGiven | None) -> LinesGiven:
 
 def _image_alone(path: Path, options: Options) -> Imported:
     """A recording of image lines and nothing else."""
-    strip = open_strip(image_alone(path, options.lines), options.camera)
-    notes = [*strip.notes, f"{path.name}: image lines alone: no poses, and no configuration/project"]
-    start = int(strip.time_ns[0])
+    strips = open_strips(image_alone(path, options.lines), options.camera)
+    notes = [note for strip in strips for note in strip.notes]
+    notes.append(f"{path.name}: image lines alone: no poses, and no configuration/project")
+    start = int(strips[0].time_ns[0])
     camera = options.camera
     first = [] if camera is None else [Message("configuration/camera", start, camera_message(camera), "import")]
-    return Imported("lines", with_lines(first, strip, notes), notes)
+    return Imported("lines", with_lines(first, strips, notes), notes)
 
 
 def sensor_span(path: Path, kind: str, options: Options) -> tuple[int, int] | None:
@@ -361,8 +358,10 @@ def sensor_span(path: Path, kind: str, options: Options) -> tuple[int, int] | No
     return (begin, end) if begin <= end else None
 
 
-def within(strip: ImageStrip, begin_ns: int, end_ns: int, what: str) -> ImageStrip:
-    """The strip, with a note about lines that were imaged before or after there was any of something.
+def within(strips: list[ImageStrip], begin_ns: int, end_ns: int, what: str) -> list[ImageStrip]:
+    """The strips, with a note about lines that were imaged before or after there was any of something.
+
+    Of several, those without any such line are left out.
 
     Parameters
     ----------
@@ -373,13 +372,26 @@ def within(strip: ImageStrip, begin_ns: int, end_ns: int, what: str) -> ImageStr
     ------
     UserError : no line was imaged between these
     """
-    first, last = int(strip.time_ns[0]), int(strip.time_ns[-1])
-    if last < begin_ns or first > end_ns:
+    inside, outside = [], []
+    for strip in strips:
+        there = strip.time_ns[-1] >= begin_ns and strip.time_ns[0] <= end_ns
+        (inside if there else outside).append(strip)
+    if not inside:
+        first, last = int(strips[0].time_ns[0]), int(strips[-1].time_ns[-1])
         spans = [f"{_utc(a)} to {_utc(b)}" for a, b in ((first, last), (begin_ns, end_ns))]
         day = " (GPS seconds without a day count from 1980-01-06, wanted --date)" if begin_ns < _NO_DAY_NS else ""
         raise UserError(
-            f"strip {strip.id}: lines from {spans[0]}, but {what} from {spans[1]}; wanted the same time scale{day}"
+            f"strip {strips[0].id}: lines from {spans[0]}, but {what} from {spans[1]}; wanted the same time scale{day}"
         )
+    found = [_with_note(strip, begin_ns, end_ns, what) for strip in inside]
+    if outside:
+        notes = [note for strip in outside for note in strip.notes]
+        notes.append(f"outside the time of the {what} and left out: strips {', '.join(strip.id for strip in outside)}")
+        found[0] = replace(found[0], notes=(*notes, *found[0].notes))
+    return found
+
+
+def _with_note(strip: ImageStrip, begin_ns: int, end_ns: int, what: str) -> ImageStrip:
     rounded_ns = round(SAME_S * SECOND_NS)
     out = int(np.count_nonzero((strip.time_ns < begin_ns - rounded_ns) | (strip.time_ns > end_ns + rounded_ns)))
     if not out:

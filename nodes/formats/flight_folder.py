@@ -35,7 +35,8 @@ from .detect import KINDS, Imported, Options, kind_of_path, read_any, read_track
 from .envi_image import TYPES
 from .geocal_xml import read_glas_camera
 from .ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
-from .image_lines import ImageStrip, LinesGiven, open_strip
+from .image_cubes import cubes_of, is_pattern
+from .image_lines import ImageStrip, LinesGiven, open_strips
 from .keys import Keys, is_there, read_toml
 from .line_time_files import times_beside
 from .new_file import new_file
@@ -746,12 +747,16 @@ def _strip(flight: Flight, keys: Keys) -> None:
         if "@" in name and not is_there(flight.folder / name):
             name, _, band = name.rpartition("@")
         files.append((view, name, band))
-    missing = [name for name in dict.fromkeys(name for _, name, _ in files) if not is_there(flight.folder / name)]
+    named = {name: flight.folder / name for _, name, _ in files}
+    missing = [name for name, path in named.items() if not is_there(path) and not is_pattern(path)]
     if len(missing) > 1:
         shown = ", ".join(name[:200] for name in missing[:MISSING_SHOWN])
         more = f" and {len(missing) - MISSING_SHOWN} more" if len(missing) > MISSING_SHOWN else ""
         raise UserError(f"{keys.path}: {images.where}: {len(missing)} files are not in the folder: {shown}{more}")
-    files = [(view, _beside(flight, images, view, name), band) for view, name, band in files]
+    for view, name, _ in files:
+        if name in missing:
+            _beside(flight, images, view, name)
+    files = [(view, named[name], band) for view, name, band in files]
     times = _beside(flight, keys, "line_times", keys.text("line_times")) if keys.has("line_times") else None
     first = None
     if keys.has("first_time") or keys.has("line_rate_hz"):
@@ -769,7 +774,7 @@ def _strip(flight: Flight, keys: Keys) -> None:
         raise keys.refuse("type", f"one of {', '.join(TYPES)}")
     given = LinesGiven(tuple(files), id, times, first, band, pair, flight.day, raw)
     track = flight.track
-    beside = times_beside(files[0][1])
+    beside = times_beside(cubes_of(files[0][1], headless=keys.has("type"))[0])
     if times is None and first is None and beside is None and (track is None or track.line_rate_hz <= 0):
         raise UserError(
             f"{keys.path}: {keys.where}: times of the lines missing, wanted line_times, or first_time and line_rate_hz"
@@ -782,13 +787,14 @@ def _strip(flight: Flight, keys: Keys) -> None:
 def _open(flight: Flight, given: LinesGiven) -> None:
     """Add the images of a strip."""
     track = flight.track
-    strip = open_strip(given, flight.camera, track.time_ns if track is not None and track.line_rate_hz > 0 else None)
+    strips = open_strips(given, flight.camera, track.time_ns if track is not None and track.line_rate_hz > 0 else None)
     if flight.span_ns is None and flight.kind == "ros2" and flight.navigation is not None:
         flight.span_ns = sensor_span(flight.navigation, flight.kind, Options(flight.day))
     if flight.span_ns is not None:
-        strip = within(strip, *flight.span_ns, "poses" if track is not None else "sensors")
-    notes = () if flight.camera is None else strip.notes  # a missing camera is told once
-    flight.strips.append(replace(strip, notes=tuple(map(flight.in_keys, notes))))
+        strips = within(strips, *flight.span_ns, "poses" if track is not None else "sensors")
+    for strip in strips:
+        notes = () if flight.camera is None else strip.notes  # a missing camera is told once
+        flight.strips.append(replace(strip, notes=tuple(map(flight.in_keys, notes))))
 
 
 def _node(nodes: Keys, name: str) -> None:

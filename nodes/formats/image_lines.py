@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import date
+from datetime import UTC, date, datetime
 from heapq import merge
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,13 @@ from ...schemas import messages as m
 from ...schemas.image_lines import LineBlock
 from ...schemas.topics import rank
 from ...solver.camera.line_camera import LineCamera
-from ..convert import SECOND_NS
+from ..convert import SECOND_NS, STRIP_SILENT_S
 from ..errors import UserError
 from ..node import Message
 from .envi import header_of
 from .envi_image import TYPES, open_envi, open_raw
 from .grey_image import GreyImage, ImageFile
+from .image_cubes import cubes_of, joined
 from .line_time_files import line_times, times_beside
 from .tiff_image import is_tiff, open_tiff
 from .time_columns import instant_ns
@@ -39,7 +40,7 @@ class LinesGiven:
 
     Attributes
     ----------
-    files : (id of the CCD line or "", image, band or None), one a view
+    files : (id of the CCD line or "", image or pattern of cubes, band or None), one a view
     strip : id of the strip; the name of the first file where it is empty
     times : file with the time of each line, or None for one beside the image, or the times of poses
     first : time of line 0 in ISO 8601, and lines a second; None with ``times``
@@ -153,10 +154,13 @@ def files_of(texts: Sequence[str]) -> tuple[tuple[str, Path, str | None], ...]:
     return tuple(found)
 
 
-def open_strip(
+def open_strips(
     given: LinesGiven, camera: LineCamera | None = None, pose_times_ns: NDArray[np.int64] | None = None
-) -> ImageStrip:
+) -> list[ImageStrip]:
     """The images of a strip, with the time of each line.
+
+    A pattern, as in ``raw_*``, names cubes. They follow one another in the order of the numbers in their names, and
+    a new strip begins where a cube begins more than `STRIP_SILENT_S` after the end of that before it.
 
     Parameters
     ----------
@@ -168,39 +172,71 @@ def open_strip(
     ------
     UserError : images or times that cannot be read, or do not fit together or to the camera
     """
-    views: dict[str, GreyImage] = {}
+    views: dict[str, list[ImageFile]] = {}
+    bands: dict[str, str | None] = {}
     notes: list[str] = []
-    first: GreyImage | None = None
     _refuse_type_without_effect(given)
     for name, path, band in given.files:
         view = _view(name, path, camera)
-        image = open_image(path, given.raw, 0 if camera is None else camera.lines[camera.line_index[view]].pixels)
+        pixels = 0 if camera is None else camera.lines[camera.line_index[view]].pixels
+        cubes = [open_image(file, given.raw, pixels) for file in cubes_of(path, headless=given.raw is not None)]
+        image = joined(cubes)
         notes.extend(image.notes)
-        if camera is not None and camera.lines[camera.line_index[view]].pixels != image.samples:
-            wanted = f"{camera.lines[camera.line_index[view]].pixels} as CCD line {view} of the camera has pixels"
-            raise UserError(f"{path}: {image.samples} samples, wanted {wanted}")
-        grey = GreyImage(image, image.weights(band or given.band), given.span)
-        if first is not None and image.lines != first.image.lines:
-            raise UserError(f"{path}: {image.lines} lines, wanted {first.image.lines} as in {first.image.path.name}")
-        first = first or grey
-        views[view] = grey
-    if first is None:
+        if pixels and pixels != image.samples:
+            wanted = f"{pixels} as CCD line {view} of the camera has pixels"
+            raise UserError(f"{image.path}: {image.samples} samples, wanted {wanted}")
+        for first in list(views.values())[:1]:
+            _refuse_other_lines(cubes, first)
+        views[view], bands[view] = cubes, band or given.band
+    if not views:
         raise UserError("--lines: no image, wanted VIEW=FILE, as in F=forward.img,N=nadir.img")
     if camera is None:
         notes.append("no camera given (--camera): recorded without configuration/camera, image lines cannot be matched")
     elif set(views) < {line.id for line in camera.lines}:
         lost = [line.id for line in camera.lines if line.id not in views]
         notes.append(f"no image of the CCD lines {', '.join(lost)} of the camera")
-    lines = first.image.lines
+    cubes = next(iter(views.values()))
+    time_ns, equal = _times(given, cubes, pose_times_ns, notes)
+    ends = np.cumsum([cube.lines for cube in cubes])
+    late = time_ns[ends[:-1]] - time_ns[ends[:-1] - 1] > STRIP_SILENT_S * SECOND_NS
+    parts = np.split(np.arange(len(cubes)), np.flatnonzero(late) + 1)
+    strips = []
+    for part in parts:
+        images = {view: joined(files[part[0] : part[-1] + 1]) for view, files in views.items()}
+        grey = {view: GreyImage(image, image.weights(bands[view]), given.span) for view, image in images.items()}
+        times = time_ns[ends[part[0]] - cubes[part[0]].lines : ends[part[-1]]]
+        name = given.strip or cubes[0].path.stem if len(parts) == 1 else given.strip + strip_name(int(times[0]))
+        strips.append(_strip_of(name, grey, times, given.first[1] if equal and given.first else None, notes))
+        notes = []
+    return strips
+
+
+def strip_name(utc_ns: int) -> str:
+    """Of a strip in a row of them: the time at which it begins."""
+    return datetime.fromtimestamp(utc_ns // SECOND_NS, UTC).strftime("%H%M%S")
+
+
+def _strip_of(
+    id: str, views: dict[str, GreyImage], time_ns: NDArray[np.int64], rate_hz: float | None, notes: list[str]
+) -> ImageStrip:
+    """A strip of images; of lines that are equally spaced by construction with their rate."""
+    lines = len(time_ns)
     if lines < 2:
-        raise UserError(f"{first.image.path}: {lines} line, wanted at least 2")
-    time_ns, equal = _times(given, first, pose_times_ns, notes)
-    rate = (lines - 1) * 1e9 / float(time_ns[-1] - time_ns[0])
-    if equal and given.first is not None:
-        rate = given.first[1]
+        raise UserError(f"{next(iter(views.values())).image.path}: {lines} line, wanted at least 2")
+    rate = rate_hz or (lines - 1) * 1e9 / float(time_ns[-1] - time_ns[0])
     off = float(np.abs((time_ns - time_ns[0]) * (rate * 1e-9) - np.arange(lines)).max())
-    notes.extend(off_the_rate(off, rate, "the strip has that rate, tie points have the times of their lines"))
-    return ImageStrip(given.strip or first.image.path.stem, views, time_ns, rate, equal, tuple(notes))
+    told = off_the_rate(off, rate, "the strip has that rate, tie points have the times of their lines")
+    return ImageStrip(id, views, time_ns, rate, rate_hz is not None, (*notes, *told))
+
+
+def _refuse_other_lines(cubes: list[ImageFile], first: list[ImageFile]) -> None:
+    """Raise UserError where the images of a view are not as long as those of the first view."""
+    if len(cubes) != len(first):
+        what = f"{len(cubes)} images from {cubes[0].path} on, wanted {len(first)}"
+        raise UserError(f"{what} as of {first[0].path.name}")
+    for cube, other in zip(cubes, first, strict=True):
+        if cube.lines != other.lines:
+            raise UserError(f"{cube.path}: {cube.lines} lines, wanted {other.lines} as in {other.path.name}")
 
 
 def off_the_rate(lines: float, rate_hz: float, so: str) -> list[str]:
@@ -211,9 +247,9 @@ def off_the_rate(lines: float, rate_hz: float, so: str) -> list[str]:
     return [f"{what}; {so}"]
 
 
-def with_lines(messages: Iterable[Message], strip: ImageStrip, notes: list[str]) -> Iterator[Message]:
-    """The messages of a flight with those of an image strip among them, by stamp and rank."""
-    yield from merge(messages, strip.messages(notes), key=_order)
+def with_lines(messages: Iterable[Message], strips: Sequence[ImageStrip], notes: list[str]) -> Iterator[Message]:
+    """The messages of a flight with those of image strips among them, by stamp and rank."""
+    yield from merge(messages, *(strip.messages(notes) for strip in strips), key=_order)
 
 
 def _order(message: Message) -> tuple[int, int]:
@@ -275,10 +311,10 @@ def _view(name: str, path: Path, camera: LineCamera | None) -> str:
 
 
 def _times(
-    given: LinesGiven, image: GreyImage, pose_times_ns: NDArray[np.int64] | None, notes: list[str]
+    given: LinesGiven, cubes: list[ImageFile], pose_times_ns: NDArray[np.int64] | None, notes: list[str]
 ) -> tuple[NDArray[np.int64], bool]:
     """Times of the lines (n,), and whether they are equally spaced by construction."""
-    lines, path = image.image.lines, image.image.path
+    lines, path = sum(cube.lines for cube in cubes), cubes[0].path
     if given.times is not None and given.first is not None:
         raise UserError(f"{given.times}: line times and a first time with a rate, wanted one of them")
     if given.first is not None:
@@ -287,15 +323,36 @@ def _times(
             raise UserError(f"--line-rate {rate:g}, wanted more than 0 Hz")
         start = instant_ns(text, "--first-time")
         return start + np.rint(np.arange(lines) * (1e9 / rate)).astype(np.int64), True
-    times = given.times or times_beside(path)
-    if times is not None:
-        time_ns, source = line_times(times, given.day, notes), str(times)
-    elif pose_times_ns is not None:
-        time_ns, source = pose_times_ns, "the file of poses, one a line,"
-    else:
+    if given.times is not None:
+        return _of_file(given.times, path, lines, given.day, notes), False
+    if times_beside(path) is not None:
+        return _beside(cubes, given.day, notes), False
+    if pose_times_ns is None:
         raise UserError(
             f"{path}: times of its lines are missing, wanted --line-times CSV, or --first-time and --line-rate"
         )
+    if len(pose_times_ns) != lines:
+        has = f"the file of poses, one a line, has the times of {len(pose_times_ns)}"
+        raise UserError(f"{path}: {lines} lines, but {has}")
+    return pose_times_ns, False
+
+
+def _of_file(times: Path, image: Path, lines: int, day: date | None, notes: list[str]) -> NDArray[np.int64]:
+    time_ns = line_times(times, day, notes)
     if len(time_ns) != lines:
-        raise UserError(f"{path}: {lines} lines, but {source} has the times of {len(time_ns)}")
-    return time_ns, False
+        raise UserError(f"{image}: {lines} lines, but {times} has the times of {len(time_ns)}")
+    return time_ns
+
+
+def _beside(cubes: list[ImageFile], day: date | None, notes: list[str]) -> NDArray[np.int64]:
+    """Times of lines that a camera's program has written beside each of its cubes."""
+    found: list[NDArray[np.int64]] = []
+    for cube in cubes:
+        times = times_beside(cube.path)
+        if times is None:
+            raise UserError(f"{cube.path}: no times of its lines beside it, as {cubes[0].path.name} has them")
+        time_ns = _of_file(times, cube.path, cube.lines, day, notes if not found else [])
+        if found and time_ns[0] <= found[-1][-1]:
+            raise UserError(f"{times}: begins before the cube before it ends, wanted cubes in the order of time")
+        found.append(time_ns)
+    return np.concatenate(found)

@@ -6,7 +6,6 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from heapq import merge
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from ...solver.camera.line_camera import LineCamera
 from ..convert import SECOND_NS, STRIP_SILENT_S
 from ..errors import UserError
 from ..node import Message
-from .image_lines import BLOCK_S, CLOSING_NS, off_the_rate
+from .image_lines import BLOCK_S, CLOSING_NS, off_the_rate, strip_name
 from .ros2_decoding import decoded
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -97,11 +96,6 @@ def lines_missing(time_ns: int, next_ns: int, period_ns: float, rows: int) -> in
     """Lines between two images that never came; stamps may be off by half an image."""
     missing = round((time_ns - next_ns) / period_ns)
     return missing if missing > rows // 2 else 0
-
-
-def strip_name(utc_ns: int) -> str:
-    """Of a strip in a row of them: the time at which it begins."""
-    return datetime.fromtimestamp(utc_ns // SECOND_NS, UTC).strftime("%H%M%S")
 
 
 def ccd_lines(path: Path, counts: Mapping[str, int], given: ImageTopics, notes: list[str]) -> dict[str, str]:

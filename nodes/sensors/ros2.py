@@ -24,10 +24,11 @@ from ...solver.camera.line_camera import LineCamera
 from ..bus.session import listen_elsewhere
 from ..convert import SECOND_NS, STRIP_SILENT_S, set_time
 from ..errors import UserError
+from ..formats.image_lines import strip_name
 from ..formats.keys import Keys
 from ..formats.ros2 import IMU, fix_messages, inertial_messages
 from ..formats.ros2_decoding import FIX
-from ..formats.ros2_images import IMAGE, image_rows, lines_missing, strip_name
+from ..formats.ros2_images import IMAGE, image_rows, lines_missing
 from ..node import Message
 from .blocks import block_message
 from .program import LOOK_S, Clock, Sensor, noise_of, publish, refuse_unknown

@@ -286,8 +286,8 @@ def test_no_line_is_outside_of_poses_for_the_rounding_of_their_times(folder):
     """Of poses of each line, which another program wrote, the last one was a nanosecond too early."""
     strip = read_flight(folder).strips[0]
     first, last = int(strip.time_ns[0]), int(strip.time_ns[-1])
-    assert within(strip, first + 900, last - 900, "poses").notes == strip.notes
-    (note,) = within(strip, first, last - 2000, "poses").notes[len(strip.notes) :]
+    assert within([strip], first + 900, last - 900, "poses")[0].notes == strip.notes
+    (note,) = within([strip], first, last - 2000, "poses")[0].notes[len(strip.notes) :]
     assert "1 of 50 lines outside the time of the poses" in note
 
 

@@ -15,9 +15,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from triline.nodes.convert import time_ns
 from triline.nodes.errors import UserError
+from triline.nodes.formats.image_lines import strip_name
 from triline.nodes.formats.keys import Keys
 from triline.nodes.formats.ros2 import fix_messages, inertial_messages
-from triline.nodes.formats.ros2_images import image_rows, strip_name
+from triline.nodes.formats.ros2_images import image_rows
 from triline.nodes.matcher.found_strips import FoundStrips
 from triline.nodes.sensors.ros2 import LiveStrips, Ros2, Ros2Settings, key_expression
 from triline.solver.matching.line_times import LineTimes
