@@ -14,8 +14,6 @@ from ..node import Message
 
 Array = NDArray[np.floating]
 
-#: When simulated flights begin.
-EPOCH_NS = 1_780_000_000_000_000_000
 #: A rough flight: three times the turbulence on a stabilised mount, and an attitude whose slow errors are ten times
 #: those of the plain one.
 ROUGH: dict[str, Any] = {"turbulence": 3.0, "wander_attitude": [0.05, 0.05, 0.1]}

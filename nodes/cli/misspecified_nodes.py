@@ -16,31 +16,21 @@ from ...solver.window.results import AdjustedPoint, RefinedOrientation
 from .. import convert
 from ..adjuster.adjuster import Adjuster
 from ..navigator.navigator import Navigator
-from ..recording.reader import RecordingReader
-from ..recording.runner import process
-from ..recording.writer import RecordingWriter
 from ..report.flight import Flight, collect
 from ..report.source import messages_of
 from ..simulator.simulator import Simulator
-
-EPOCH_NS = 1_780_000_000_000_000_000
+from .study_flights import EPOCH_NS, processed
 
 
 def through_nodes(simulation: Simulation, poses: list[TimedPose]) -> OnlineAnswer:
     """What `triline process` makes of the recording of a flight; its navigator makes its own poses."""
     with tempfile.TemporaryDirectory() as folder:
-        return answer_of(collect(messages_of(processed(simulation, Path(folder)))))
+        return answer_of(collect(messages_of(recording_of(simulation, Path(folder)))))
 
 
-def processed(simulation: Simulation, folder: Path) -> Path:
+def recording_of(simulation: Simulation, folder: Path) -> Path:
     """The recording of a flight after navigator and adjuster, in a folder."""
-    recording, out = folder / "flight.mcap", folder / "out.mcap"
-    with RecordingWriter(recording) as writer:
-        for message in Simulator(simulation).messages(EPOCH_NS):
-            writer.write(message)
-    with RecordingWriter(out) as writer:
-        process(RecordingReader(recording), [Navigator(), Adjuster(grid_hz=GRID_HZ)], writer.write_raw)
-    return out
+    return processed(Simulator(simulation).messages(EPOCH_NS), [Navigator(), Adjuster(grid_hz=GRID_HZ)], folder)
 
 
 def answer_of(flight: Flight) -> OnlineAnswer:

@@ -16,12 +16,10 @@ from ..formats.json_text import json_text
 from ..matcher.matcher import Matcher
 from ..navigator.navigator import Navigator
 from ..recording.reader import RecordingReader
-from ..recording.runner import process
-from ..recording.writer import RecordingWriter
 from ..simulator.flight_settings import simulated_flight
 from ..simulator.simulator import Simulator
-from .matched_ties import EPOCH_NS, ROUGH, is_matched, tie_errors
-from .progress import progress
+from .matched_ties import ROUGH, is_matched, tie_errors
+from .study_flights import EPOCH_NS, each, processed
 
 EXAMPLE = "triline study matching --seeds 3"
 #: Errors below the first value are good matches, above the second wrong ones, px; then the limits to be met.
@@ -49,12 +47,9 @@ def run(args: argparse.Namespace) -> int:
     base = {"sensor": "ads40-small", "pixels": args.pixels, "seconds": args.seconds, "lead_in": 2.0, "images": True}
     kinds = ["plain"] if args.plain else list(KINDS)
     cases = [(kind, args.first + i) for kind in kinds for i in range(args.seeds)]
-    rows = []
-    with progress("flights", args.quiet or args.json) as tell:
-        for kind, seed in cases:
-            rows.append({"kind": kind, "seed": seed, **fly({**base, **KINDS[kind], "seed": seed})})
-            if tell is not None:
-                tell(len(rows) / len(cases))
+    flights = [{**base, **KINDS[kind], "seed": seed} for kind, seed in cases]
+    found = each(fly, flights, args.quiet or args.json)
+    rows = [{"kind": kind, "seed": seed, **quality} for (kind, seed), quality in zip(cases, found, strict=True)]
     print(json_text(rows) if args.json else "\n".join(lines(rows)))
     return 0
 
@@ -64,12 +59,7 @@ def fly(settings: dict[str, Any]) -> dict[str, Any]:
     flown = simulated_flight(settings)
     simulator = Simulator(flown.simulation, flown.imager)
     with tempfile.TemporaryDirectory() as folder:
-        recording, out = Path(folder) / "flight.mcap", Path(folder) / "out.mcap"
-        with RecordingWriter(recording) as writer:
-            for message in simulator.messages(EPOCH_NS):
-                writer.write(message)
-        with RecordingWriter(out) as writer:
-            process(RecordingReader(recording), [Navigator(), Matcher(), Adjuster()], writer.write_raw)
+        out = processed(simulator.messages(EPOCH_NS), [Navigator(), Matcher(), Adjuster()], Path(folder))
         ties = [message.body for message in RecordingReader(out).messages(["observation/tie"]) if is_matched(message)]
     return tie_quality(flown.simulation.flight, ties)
 

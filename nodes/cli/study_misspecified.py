@@ -7,7 +7,6 @@ import csv
 import hashlib
 import sys
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -28,10 +27,9 @@ from ..formats.new_file import new_file, refuse_unless_writable
 from ..simulator.flight_settings import GROUND_M
 from ..simulator.motion_track import motion_of
 from ..simulator.world_settings import world_text
-from ..worker_pool import WorkerPool
 from .misspecified_flights import Flown, KeptFlights, code_digest
 from .misspecified_nodes import through_nodes
-from .progress import progress
+from .study_flights import each
 
 ONLINE = {"nodes": through_nodes, "window": through_window}
 EXAMPLE = "triline study misspecified --seeds 3 --rows stated sine-slow boresight --settings rtk"
@@ -113,22 +111,15 @@ def _flights(
     found = {flown: kept.get(flown) if kept is not None else None for flown in wanted}
     missing = [flown for flown in wanted if found[flown] is None]
     cases = [(f.setting, f.row, f.seed, args.strips, args.seconds, args.online, motion, args.told) for f in missing]
-    with progress("flights", args.quiet or args.json) as tell, _pool(min(args.jobs, len(cases))) as pool:
-        for i, figures in enumerate((pool.map if pool else map)(_fly, cases), 1):
-            found[missing[i - 1]] = figures
-            if kept is not None:
-                kept.add(missing[i - 1], figures)
-            if tell is not None:
-                tell(i / len(cases))
+    for flown, figures in zip(missing, each(_fly, cases, args.quiet or args.json, args.jobs), strict=True):
+        found[flown] = figures
+        if kept is not None:
+            kept.add(flown, figures)
     flights: dict[tuple[str, str], list[FlightFigures]] = {key: [] for key in keys}
     for flown, figures in found.items():
         if figures is not None:
             flights[flown.setting, flown.row].append(figures)
     return flights
-
-
-def _pool(jobs: int) -> WorkerPool | nullcontext[None]:
-    return WorkerPool(jobs) if jobs > 1 else nullcontext()
 
 
 def _plan(args: argparse.Namespace) -> str:

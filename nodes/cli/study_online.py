@@ -14,18 +14,14 @@ from ..adjuster.adjuster import Adjuster
 from ..errors import UserError
 from ..formats.json_text import json_text
 from ..navigator.navigator import Navigator
-from ..recording.reader import RecordingReader
-from ..recording.runner import process
-from ..recording.writer import RecordingWriter
 from ..report.evaluation import evaluate_flight, orientation_errors
 from ..report.flight import collect
 from ..report.source import messages_of
 from ..simulator.flight_settings import simulated_flight
 from ..simulator.simulator import Simulator
-from .progress import progress
+from .study_flights import EPOCH_NS, each, processed
 
 EXAMPLE = "triline study online --seeds 20"
-EPOCH_NS = 1_780_000_000_000_000_000
 KINDS = ("live", "final")
 
 
@@ -39,26 +35,17 @@ def run(args: argparse.Namespace) -> int:
     if args.seeds < 2:
         raise UserError(f"--seeds {args.seeds}, wanted 2 at least")
     settings = {"seconds": args.seconds, "unstabilised": args.unstabilised}
-    flights = []
-    with tempfile.TemporaryDirectory() as folder, progress("flights", args.quiet or args.json) as tell:
-        for seed in range(args.seeds):
-            flights.append(fly({**settings, "seed": seed}, Path(folder)))
-            if tell is not None:
-                tell((seed + 1) / args.seeds)
-    result = summary(flights)
+    cases = [{**settings, "seed": seed} for seed in range(args.seeds)]
+    result = summary(list(each(fly, cases, args.quiet or args.json)))
     print(json_text(result) if args.json else "\n".join(lines(result)))
     return 0
 
 
-def fly(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
+def fly(settings: dict[str, Any]) -> dict[str, Any]:
     """One flight: simulate, record, process the recording, evaluate."""
-    recording, processed = folder / "flight.mcap", folder / "processed.mcap"
-    with RecordingWriter(recording) as writer:
-        for message in Simulator(simulated_flight(settings).simulation).messages(EPOCH_NS):
-            writer.write(message)
-    with RecordingWriter(processed) as writer:
-        process(RecordingReader(recording), [Navigator(), Adjuster()], writer.write_raw)
-    flight = collect(messages_of(processed))
+    messages = Simulator(simulated_flight(settings).simulation).messages(EPOCH_NS)
+    with tempfile.TemporaryDirectory() as folder:
+        flight = collect(messages_of(processed(messages, [Navigator(), Adjuster()], Path(folder))))
     evaluated = evaluate_flight(flight)
     middle = {}
     for kind, (_, error, covariance, _) in orientation_errors(flight).items():

@@ -27,16 +27,13 @@ from ..matcher.matcher import Matcher
 from ..navigator.navigator import Navigator
 from ..node import Message
 from ..recording.reader import RecordingReader
-from ..recording.runner import process
-from ..recording.writer import RecordingWriter
 from ..report.evaluation import orientation_errors
 from ..report.flight import collect
 from ..report.source import messages_of
 from ..simulator.flight_settings import simulated_flight
 from ..simulator.simulator import Simulator
-from ..worker_pool import WorkerPool
-from .matched_ties import EPOCH_NS, ROUGH
-from .progress import progress
+from .matched_ties import ROUGH
+from .study_flights import EPOCH_NS, each, processed
 
 EXAMPLE = "triline study starts --seeds 3"
 WRONG_PX = 30.0
@@ -65,12 +62,7 @@ def run(args: argparse.Namespace) -> int:
         for rough in (False, True)
         for i in range(args.seeds)
     ]
-    rows = []
-    with progress("flights", args.quiet or args.json) as tell, WorkerPool(args.jobs) as pool:
-        for row in (pool.map if args.jobs > 1 else map)(fly, cases):
-            rows.append(row)
-            if tell is not None:
-                tell(len(rows) / len(cases))
+    rows = list(each(fly, cases, args.quiet or args.json, args.jobs))
     print(json_text(rows) if args.json else "\n".join(lines(rows)))
     return 0
 
@@ -83,12 +75,8 @@ def fly(case: tuple[str, bool, dict[str, Any]]) -> dict[str, Any]:
     assert flown.imager is not None
     matcher = _Predicting()
     with tempfile.TemporaryDirectory() as folder:
-        recording, out = Path(folder) / "flight.mcap", Path(folder) / "out.mcap"
-        with RecordingWriter(recording) as writer:
-            for message in Simulator(simulation, flown.imager).messages(EPOCH_NS):
-                writer.write(message)
-        with RecordingWriter(out) as writer:
-            process(RecordingReader(recording), [Navigator(), matcher, Adjuster()], writer.write_raw)
+        messages = Simulator(simulation, flown.imager).messages(EPOCH_NS)
+        out = processed(messages, [Navigator(), matcher, Adjuster()], Path(folder))
         reader = RecordingReader(out)
         stamps = [tie.stamp_ns for tie in reader.messages(["observation/tie"])]
         # reports tell how long the window is; the first one is over when its ties have been worked in

@@ -29,16 +29,13 @@ from ..matcher.matcher import Matcher
 from ..navigator.navigator import Navigator
 from ..node import Message
 from ..recording.reader import RecordingReader
-from ..recording.runner import process
-from ..recording.writer import RecordingWriter
 from ..report.evaluation import orientation_errors
 from ..report.flight import collect
 from ..report.source import messages_of
 from ..simulator.flight_settings import simulated_flight
 from ..simulator.simulator import Simulator
-from ..worker_pool import WorkerPool
-from .matched_ties import EPOCH_NS, ROUGH, is_matched, is_target, simulated_ties, tie_errors
-from .progress import progress
+from .matched_ties import ROUGH, is_matched, is_target, simulated_ties, tie_errors
+from .study_flights import EPOCH_NS, each, processed
 
 EXAMPLE = "triline study ties --seeds 6"
 #: Matched ties may be worse than simulated ones by this factor.
@@ -70,12 +67,7 @@ def run(args: argparse.Namespace) -> int:
     cases = [
         {**base, **KINDS[kind], "seed": args.first + i, "kind": kind} for kind in args.kinds for i in range(args.seeds)
     ]
-    rows = []
-    with progress("flights", args.quiet or args.json) as tell, WorkerPool(args.jobs) as pool:
-        for row in (pool.map if args.jobs > 1 else map)(partial(fly, again=args.again), cases):
-            rows.append(row)
-            if tell is not None:
-                tell(len(rows) / len(cases))
+    rows = list(each(partial(fly, again=args.again), cases, args.quiet or args.json, args.jobs))
     if args.json:
         print(json_text(rows, indent=None))
     else:
@@ -92,7 +84,7 @@ def fly(case: dict[str, Any], again: int) -> dict[str, Any]:
     checks = check_looks(flight, np.random.default_rng(case["seed"]))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        matched, ties, sigma0 = processed(messages, [Navigator(), Matcher(), Adjuster()], folder, checks)
+        matched, ties, sigma0 = evaluated(messages, [Navigator(), Matcher(), Adjuster()], folder, checks)
         found = [message for message in ties if is_matched(message)]
         # control is the same in both: targets as they were measured
         others = [message for message in messages if not message.topic.startswith("sensor/lines/")]
@@ -102,7 +94,7 @@ def fly(case: dict[str, Any], again: int) -> dict[str, Any]:
         simulated = []
         for k in range(again):
             ties = simulated_ties(flight, found, np.random.default_rng([case["seed"], k]), normalised**0.5)
-            simulated.append(processed([*others, *ties], [Navigator(), Adjuster()], folder, checks))
+            simulated.append(evaluated([*others, *ties], [Navigator(), Adjuster()], folder, checks))
     return {
         "kind": case["kind"], "seed": case["seed"], "ties": len(found), "normalised": normalised,
         "matched": matched.tolist(), "sigma0": sigma0, "simulated": [part[0].tolist() for part in simulated],
@@ -110,16 +102,11 @@ def fly(case: dict[str, Any], again: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def processed(
+def evaluated(
     messages: Iterable[Message], nodes: list[Any], folder: Path, checks: CheckLooks
 ) -> tuple[Array, list[Message], float]:
     """Mean squared errors (9,) of the final orientation and of the ground that it gives; ties; sigma0."""
-    recording, out = folder / "flight.mcap", folder / "out.mcap"
-    with RecordingWriter(recording) as writer:
-        for message in messages:
-            writer.write(message)
-    with RecordingWriter(out) as writer:
-        process(RecordingReader(recording), nodes, writer.write_raw)
+    out = processed(messages, nodes, folder)
     flight = collect(messages_of(out))
     time_ns, error, *_ = orientation_errors(flight)["final"]
     ground = checks.errors((time_ns - EPOCH_NS) * 1e-9, error)

@@ -10,7 +10,7 @@ from places import MOTION, needs_motion
 
 from triline.nodes.cli import main, study_misspecified
 from triline.nodes.cli.misspecified_flights import Flown, KeptFlights
-from triline.nodes.cli.misspecified_nodes import EPOCH_NS, answer_of, processed
+from triline.nodes.cli.misspecified_nodes import EPOCH_NS, answer_of, recording_of
 from triline.nodes.report.evaluation import evaluate
 from triline.nodes.report.flight import collect
 from triline.nodes.report.source import messages_of
@@ -114,7 +114,7 @@ def test_the_nodes_give_what_process_gives(tmp_path):
     """The figures are those of a processed recording; the window alone is close to them as long as nothing is wrong."""
     plan = FlightPlan(strip_s=12.0, lead_in_s=2.0, lead_out_s=1.0)
     flown = simulate(plan, 1, replace(SETTINGS["rtk"], attitude_rate_hz=20.0), OBSERVED)
-    out = processed(flown, tmp_path)
+    out = recording_of(flown, tmp_path)
     through, expected = answer_of(collect(messages_of(out))), evaluate(out)
     found = online_quality(flown, through, np.zeros(3))
     row = expected["points"]["adjusted_whole"]
@@ -188,7 +188,7 @@ def test_a_boresight_is_not_taken_for_the_camera(tmp_path, monkeypatch, seconds)
     simulation = simulate(plan, 4, SETTINGS["rtk"], OBSERVED, world=ROWS["boresight"].world)
     everything, end_ns = Simulator.messages, EPOCH_NS + seconds * 1e9
     monkeypatch.setattr(Simulator, "messages", lambda *of: (m for m in everything(*of) if m.stamp_ns < end_ns))
-    answer = answer_of(collect(messages_of(processed(simulation, tmp_path))))
+    answer = answer_of(collect(messages_of(recording_of(simulation, tmp_path))))
     assert not any("calibration of the camera" in event for event in answer.events)
     assert online_quality(simulation, answer, np.zeros(3)).points_m < (0.2 if seconds > 60.0 else 0.3)
 
