@@ -12,6 +12,7 @@ from typing import Any
 
 from ..errors import UserError
 from ..terminal import clean_streams, plain
+from .common_options import add_common
 from .ending import EndedBySignal, ended_by_signals
 from .outputs import refuse_empty_words, refuse_input_as_output
 
@@ -83,19 +84,9 @@ def _parser(command: str, names: list[str]) -> tuple[argparse.ArgumentParser, ar
             module.add_arguments(sub)
             sub.epilog = f"example:\n  {module.EXAMPLE}"
             sub.set_defaults(run=module.run)
-            _add_common(sub)
+            add_common(sub)
             chosen = sub
     return parser, chosen
-
-
-def _add_common(parser: argparse.ArgumentParser) -> None:
-    taken = {option for action in parser._actions for option in action.option_strings}
-    if "--json" not in taken:
-        parser.add_argument("--json", action="store_true", help="print a machine-readable result")
-    if "-q" not in taken:
-        parser.add_argument("-q", "--quiet", action="store_true", help="print only the result and errors")
-    if "-v" not in taken:
-        parser.add_argument("-v", "--verbose", action="store_true", help="print details")
 
 
 def _load(module_name: str) -> Any:

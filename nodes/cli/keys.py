@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from ..formats.json_text import json_text
+from .common_options import add_common
 
 EXAMPLE = """triline keys new survey                                   # an authority, in the folder survey
   triline keys aircraft aircraft1 --authority survey --host 10.77.0.1
@@ -38,13 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     revoke.add_argument("name", metavar="NAME")
     actions.add_parser("list", help="who is certified")
     for action, sub in actions.choices.items():
-        # after the action, too; what stands before it stays
-        for words, text in (
-            (("--json",), "print a machine-readable result"),
-            (("-q", "--quiet"), "print only the result and errors"),
-            (("-v", "--verbose"), "print details"),
-        ):
-            sub.add_argument(*words, action="store_true", default=argparse.SUPPRESS, help=text)
+        add_common(sub, again=True)
         if action != "new":
             sub.add_argument("--authority", type=Path, default=Path(), metavar="DIR", help="its folder (default: here)")
 

@@ -6,6 +6,8 @@ import argparse
 import importlib
 from typing import Any
 
+from .common_options import add_common
+
 #: study -> (module beside this one, one line of help); a module has EXAMPLE, add_arguments(parser) and run(args),
 #: and WANTS_INPUT where it needs data of the user.
 STUDIES: dict[str, tuple[str, str]] = {
@@ -28,12 +30,6 @@ STUDIES: dict[str, tuple[str, str]] = {
 
 EXAMPLE = "triline study testfields --seeds 10"
 
-_COMMON = (
-    (("--json",), "print a machine-readable result"),
-    (("-q", "--quiet"), "print only the result and errors"),
-    (("-v", "--verbose"), "print details"),
-)
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     subparsers = parser.add_subparsers(dest="study", metavar="STUDY", required=True)
@@ -44,17 +40,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         sub.epilog = f"example:\n  {module.EXAMPLE}"
         module.add_arguments(sub)
         sub.set_defaults(run_study=module.run)
-        _add_common(sub)
+        add_common(sub, again=True)
     sub = subparsers.add_parser("all", help="all that need no data, one after another, with their defaults")
     sub.set_defaults(run_study=_run_all)
-    _add_common(sub)
-
-
-def _add_common(parser: argparse.ArgumentParser) -> None:
-    """Accept the common options after the name of the study, too; SUPPRESS keeps those given before it."""
-    for flags, text in _COMMON:
-        if flags[0] not in parser._option_string_actions:
-            parser.add_argument(*flags, action="store_true", default=argparse.SUPPRESS, help=text)
+    add_common(sub, again=True)
 
 
 def _load(module_name: str) -> Any:
