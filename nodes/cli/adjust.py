@@ -68,7 +68,7 @@ from ..terminal import drawing, plain, redraws, width
 from ..voices import RecordedVoices
 from .adjust_scenes import run_scenes
 from .dem_options import add_dem_options, dem_settings
-from .locate import refraction_of
+from .location_options import refraction_of
 from .navigated import navigated
 from .outputs import refuse_folder_of_inputs
 

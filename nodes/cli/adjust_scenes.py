@@ -25,7 +25,7 @@ from ..errors import UserError
 from ..formats.json_text import json_text
 from ..formats.new_file import new_file, new_files
 from ..formats.scene_block import SceneBlockData, read_scene_block
-from .locate import refraction_of
+from .location_options import refraction_of
 
 #: More unknowns of correction functions a lens than this want more memory than they are worth.
 MOST_PIECES = 60

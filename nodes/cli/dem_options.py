@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..config import elevation
-from ..errors import UserError
+from ..errors import UserError, flag
 
 _OF_DEM = ("dem_sigma", "dem_shift_sigma", "dem_crs")
 
@@ -39,12 +39,12 @@ def dem_settings(args: argparse.Namespace) -> dict[str, Any]:
     given = {name: value for name in _OF_DEM if (value := getattr(args, name)) is not None}
     if args.dem is not None and (args.dem / "flight.toml").is_file():
         if given:
-            raise UserError(f"--{next(iter(given)).replace('_', '-')}: [dem] of {args.dem / 'flight.toml'} says it")
+            raise UserError(f"{flag(next(iter(given)))}: [dem] of {args.dem / 'flight.toml'} says it")
         return elevation(args.dem / "flight.toml", wanted=True)
     if args.dem is not None and "dem_sigma" not in given:
         raise UserError("--dem and --dem-sigma: wanted both, the raster and the sigma of its heights")
     for name, value in given.items():
-        option = "--" + name.replace("_", "-")
+        option = flag(name)
         if args.dem is None:
             raise UserError(f"{option} {value}: is of a raster of heights, wanted --dem FILE with it")
         if name != "dem_crs" and not 0 < value < float("inf"):

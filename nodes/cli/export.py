@@ -26,7 +26,7 @@ from ..batch.rectification import (
     project_frame,
 )
 from ..convert import PoseSample, R_bc_of, local_frame, pose_sample
-from ..errors import UserError
+from ..errors import UserError, flag
 from ..formats.camera_json import write_camera
 from ..formats.features import NOT_PLACED, Features, answers, features_of
 from ..formats.geojson import write_geojson
@@ -120,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
     kind = next(name for name in (*_WRITERS, "points", "per_line") if getattr(args, name) is not None)
     for name, kinds in _GO_WITH.items():
         if getattr(args, name) is not None and kind not in kinds:
-            *flags, last = (f"--{other.replace('_', '-')}" for other in kinds)
+            *flags, last = map(flag, kinds)
             raise UserError(f"--{name}: wanted with {', '.join(flags)}{' and ' * bool(flags)}{last} only")
     refuse_input_as_output(args, kind)
     path = Path(args.recording)

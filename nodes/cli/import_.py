@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ...solver.camera.sensors import PRESETS
-from ..errors import UserError
+from ..errors import UserError, flag
 from ..formats.avirisc import LINE_RATE_HZ, avirisc_has_latitudes
 from ..formats.camera_json import write_camera
 from ..formats.detect import KINDS, Imported, Options, image_alone, kind_of_path, read_any
@@ -206,11 +206,7 @@ def _check_numbers(args: argparse.Namespace) -> None:
     ):
         values = getattr(args, name) or ()
         if not all(abs(value) <= most for value in values):
-            raise UserError(f"{_flag(name)} {' '.join(f'{v:g}' for v in values)}: wanted {wanted}")
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
+            raise UserError(f"{flag(name)} {' '.join(f'{v:g}' for v in values)}: wanted {wanted}")
 
 
 def _ground(args: argparse.Namespace) -> GroundGiven:
@@ -226,7 +222,7 @@ def _ground(args: argparse.Namespace) -> GroundGiven:
             raise UserError(f"--dem-crs {args.dem_crs}: is of a raster of heights, wanted --dem FILE with it")
         return NOT_GIVEN
     if len(given) > 1:
-        raise UserError(f"{' and '.join(_flag(name) for name in given)}: wanted one of them")
+        raise UserError(f"{' and '.join(flag(name) for name in given)}: wanted one of them")
     if args.above_ground is not None and not 0 < args.above_ground < math.inf:
         raise UserError(f"--above-ground {args.above_ground:g}, wanted more than 0 m")
     if args.ground_height is not None and not LOWEST_M < args.ground_height < HIGHEST_M:
@@ -248,7 +244,7 @@ def _lines(args: argparse.Namespace, kind: str) -> LinesGiven | None:
         alone = {"ros2": ("strip", "line_rate"), "avirisc": ("line_rate",)}.get(kind, ())
         for name in (*_IMAGES, "line_rate"):
             if getattr(args, name) is not None and name not in alone:
-                raise UserError(f"{_flag(name)} is of images, wanted --lines VIEW=FILE with it")
+                raise UserError(f"{flag(name)} is of images, wanted --lines VIEW=FILE with it")
         return LinesGiven((), strip, rate_hz=args.line_rate) if kind == "ros2" else None
     if kind == "lines" and args.date is not None and args.line_times is None:
         raise UserError("--date goes with --line-times: a first time has its day")
@@ -290,15 +286,15 @@ def _refuse_options(args: argparse.Namespace, kind: str, source: Path) -> None:
     given = [name for name in _OPTIONS if getattr(args, name) is not None]
     for name in given:
         if args.flight is not None and name not in _BESIDE_FLIGHT:
-            raise UserError(f"{_flag(name)} does not go with --flight: it stands in {args.flight / FILE}")
+            raise UserError(f"{flag(name)} does not go with --flight: it stands in {args.flight / FILE}")
         if name not in GO_WITH[kind]:
             what = "a flight folder: it stands in flight.toml" if kind == "flight" else KINDS[kind]
-            raise UserError(f"{_flag(name)} does not go with {what}")
+            raise UserError(f"{flag(name)} does not go with {what}")
     if "crs" in given and (avirisc_has_latitudes if kind == "avirisc" else csv_has_latitudes)(source):
         raise UserError(f"--crs {args.crs}: does not go with {source}, whose positions are latitude and longitude")
     of_attitudes = [name for name in ("lever_arm", "boresight", "attitude_sigma") if name in given]
     if kind == "gpx" and of_attitudes and not has_attitudes(source):
-        raise UserError(f"{_flag(of_attitudes[0])} does not go with {source}, whose positions have no attitudes")
+        raise UserError(f"{flag(of_attitudes[0])} does not go with {source}, whose positions have no attitudes")
     if args.seconds_of_day and args.date is None:
         raise UserError("--seconds-of-day goes with --date: of which day?")
 

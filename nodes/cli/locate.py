@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...solver.geometry.ellipsoid import WGS84, Ellipsoid
-from ...solver.location.refraction import STANDARD, Atmosphere, Refraction
+from ...solver.geometry.ellipsoid import WGS84
 from ...solver.location.rpc import Rpc
 from ...solver.location.uncertainty import Sigmas, ground_derivatives, pixel_covariance
 from ...solver.rectification.error_map import derivatives_on_terrain
@@ -25,6 +23,7 @@ from ..formats.new_file import new_file
 from ..formats.table import Column, Table, read_table, write_table
 from .heights_under import NothingUnder, below_camera, height_range, rasters_of_heights
 from .location_model import SENSORS, Model, read_location_model
+from .location_options import add_orientation_sigmas, refuse_datum_without_raster, stated_sigmas, with_refraction
 from .outputs import refuse_over_files
 
 EXAMPLE = """triline locate DIM_PHR1A.XML --pixels pixels.csv -o ground.csv
@@ -77,20 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="bend the rays in the air: alone for the standard atmosphere, or temperature (K), pressure (hPa) and "
         "vapour pressure (hPa) at sea level (default: straight rays)",
     )
-    parser.add_argument(
-        "--position-sigma",
-        type=float,
-        nargs=3,
-        metavar=("ALONG", "ACROSS", "UP"),
-        help="of the orbit, m; of a frame camera east, north, up",
-    )
-    parser.add_argument(
-        "--attitude-sigma",
-        type=float,
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="roll, pitch, yaw of the satellite, degrees; of a frame camera about east, north, up",
-    )
+    add_orientation_sigmas(parser)
     parser.add_argument("--pixel-sigma", type=float, metavar="PX", help="of line and sample")
     parser.add_argument("--height-sigma", type=float, metavar="M", help="of the heights given, or of the raster")
 
@@ -137,55 +123,10 @@ _FORMATS = {
 }  # fmt: skip
 
 
-def with_refraction(args: argparse.Namespace, model: Any) -> Any:
-    """The model with the air that the command line asks for."""
-    if args.refraction is None:
-        return model
-    if isinstance(model, Rpc):
-        raise UserError(f"{args.sensor}: --refraction goes with a rigorous model, this is an RPC")
-    return model.with_refraction(refraction_of(args.refraction, model.ellipsoid, args.sensor))
-
-
-def refraction_of(values: Sequence[float], ellipsoid: Ellipsoid, what: str) -> Refraction:
-    """The air that ``--refraction`` asks for, over the ellipsoid of what is located.
-
-    Raises
-    ------
-    UserError : another planet, another number of values than none and three, values that no air has
-    """
-    if abs(ellipsoid.semi_major_m / WGS84.semi_major_m - 1.0) > 1e-3:
-        raise UserError(f"{what}: --refraction knows the air of the Earth only, this is another planet")
-    if len(values) not in (0, 3):
-        raise UserError(
-            f"--refraction: {len(values)} values, wanted none, or temperature (K), pressure (hPa) and vapour "
-            "pressure (hPa)"
-        )
-    try:
-        return Refraction(Atmosphere(*values) if values else STANDARD, ellipsoid)
-    except ValueError as error:
-        raise UserError(f"--refraction: {error}") from None
-
-
-def stated_sigmas(args: argparse.Namespace, stated: Sigmas) -> Sigmas:
-    """Sigmas of the command line, and those of the file where it has none."""
-    pixel = stated.pixel if args.pixel_sigma is None else (args.pixel_sigma, args.pixel_sigma)
-    attitude = stated.attitude_rad if args.attitude_sigma is None else tuple(np.radians(args.attitude_sigma).tolist())
-    position = stated.position_m if args.position_sigma is None else tuple(args.position_sigma)
-    height = stated.height_m if args.height_sigma is None else args.height_sigma
-    try:
-        return Sigmas(position, attitude, stated.time_s, pixel, height)
-    except ValueError:
-        raise UserError(
-            "--position-sigma, --attitude-sigma, --pixel-sigma, --height-sigma: wanted numbers of at least 0"
-        ) from None
-
-
 def _terrain(args: argparse.Namespace, model: Model) -> HeightRaster | None:
     """The raster of heights that the command line names."""
+    refuse_datum_without_raster(args)
     if not args.dem:
-        for name in ("dem_crs", "dem_datum"):
-            if getattr(args, name) is not None:
-                raise UserError(f"--{name.replace('_', '-')}: goes with --dem")
         return None
     ellipsoid = WGS84 if isinstance(model, Rpc) else model.ellipsoid
     rasters = rasters_of_heights(args.dem)

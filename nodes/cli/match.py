@@ -22,6 +22,7 @@ from ..formats.json_text import json_text
 from ..formats.new_file import refuse_unless_writable
 from ..formats.scene_block import SceneBlockData, is_scene_block, read_scene_block
 from .heights_under import height_range, rasters_of_heights
+from .location_options import refuse_datum_without_raster
 from .outputs import refuse_over_files
 from .progress import progress
 
@@ -117,10 +118,7 @@ def _check(args: argparse.Namespace) -> None:
             raise UserError(f"--height {low:g} {high:g}: wanted the lowest height, and then the highest")
         if args.dem:
             raise UserError("--height and --dem: wanted one of them")
-    if not args.dem:
-        for name in ("dem_crs", "dem_datum"):
-            if getattr(args, name) is not None:
-                raise UserError(f"--{name.replace('_', '-')}: goes with --dem")
+    refuse_datum_without_raster(args)
     refuse_unless_writable(args.table or args.folder / "image_points.csv")
 
 

@@ -14,7 +14,7 @@ from ...solver.orthoimage.ground_grid import GroundGrid
 from ...solver.orthoimage.resampling import TAPS
 from ...solver.rectification.kernels import TAPS as IMAGE_TAPS
 from ..batch.rectification import ORIENTATIONS, Rectification, Rectified, line_blocks, project_frame
-from ..errors import UserError
+from ..errors import UserError, flag
 from ..formats.geotiff import is_virtual, write_orthoimage
 from ..formats.importable import refuse_importable
 from ..formats.json_text import json_text
@@ -170,7 +170,7 @@ def _check(args: argparse.Namespace) -> None:
             raise UserError(f"--{name} {value}: wanted a number")
     for name in ("pixel_sigma", "height_sigma"):
         value = getattr(args, name)
-        option = f"--{name.replace('_', '-')}"
+        option = flag(name)
         if value is not None and not 0 <= value < np.inf:
             raise UserError(f"{option} {value}: wanted a number of at least 0")
         if value is not None and args.sigma is None:
@@ -192,7 +192,7 @@ def _check(args: argparse.Namespace) -> None:
     rectify_mosaic.refuse_options(args)
     for name in rectify_image.OPTIONS:
         if name not in _OF_BOTH and rectify_image.is_given(args, name):
-            raise UserError(f"--{name.replace('_', '-')}: goes with an image and its --sensor, not with a recording")
+            raise UserError(f"{flag(name)}: goes with an image and its --sensor, not with a recording")
 
 
 def _extent(grid: GroundGrid, low: NDArray[np.floating], high: NDArray[np.floating]) -> str:

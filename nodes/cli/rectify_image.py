@@ -26,15 +26,15 @@ from ...solver.rectification.grid import MapGrid, default_crs
 from ...solver.rectification.pixel_to_cell import meet_terrain
 from ...solver.rectification.sampled import SomeCells, ground_steps, metres_a_radian
 from ..batch.image_rectification import ErrorMap, Ground, ImageRectification, SourceImage, edge_of
-from ..errors import UserError
+from ..errors import UserError, flag
 from ..formats.height_raster import DATUMS, HeightRaster
 from ..formats.json_text import json_text
 from ..formats.new_file import refuse_unless_writable
 from ..formats.projection import notes_of_map, unit_of
 from ..formats.table import Column, read_table
 from .heights_under import NO_HEIGHT_SIGMA, below_camera, height_range, rasters_of_heights
-from .locate import with_refraction
 from .location_model import SENSORS, read_location_model
+from .location_options import add_orientation_sigmas, refuse_datum_without_raster, stated_sigmas, with_refraction
 from .outputs import refuse_over_files
 from .progress import progress
 
@@ -94,14 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--occlusions", action="store_true", help="leave out what relief hides from the sensor")
     group.add_argument("--mask", metavar="FILE", help="GeoTIFF that says why cells are missing")
     group.add_argument("--sigma", metavar="FILE", help="GeoTIFF of planimetric and height sigma, metres")
-    group.add_argument(
-        "--position-sigma", type=float, nargs=3, metavar=("ALONG", "ACROSS", "UP"),
-        help="of the orbit, m; of a frame camera east, north, up",
-    )  # fmt: skip
-    group.add_argument(
-        "--attitude-sigma", type=float, nargs=3, metavar=("X", "Y", "Z"),
-        help="roll, pitch, yaw of the satellite, degrees; of a frame camera about east, north, up",
-    )  # fmt: skip
+    add_orientation_sigmas(group)
     group.add_argument("--pixel-sigma", type=float, metavar="PX", help="of what is measured in the image (matching)")
     group.add_argument("--height-sigma", type=float, metavar="M", help="of the heights")
     group.add_argument(
@@ -222,11 +215,11 @@ def _check(args: argparse.Namespace) -> None:
     for name in ("position_sigma", "attitude_sigma", "pixel_sigma", "height_sigma"):
         value = getattr(args, name)
         if value is not None and not (np.isfinite(value).all() and (np.asarray(value) >= 0).all()):
-            raise UserError(f"--{name.replace('_', '-')}: wanted numbers of at least 0")
+            raise UserError(f"{flag(name)}: wanted numbers of at least 0")
         counts = args.control is not None if name == "pixel_sigma" else args.correction == "camera"
         if value is not None and args.sigma is None and not (counts and name in ("pixel_sigma", "height_sigma")):
             more = {"pixel_sigma": " or --control", "height_sigma": " or --correction camera"}.get(name, "")
-            raise UserError(f"--{name.replace('_', '-')}: goes with --sigma FILE{more}, for which it counts")
+            raise UserError(f"{flag(name)}: goes with --sigma FILE{more}, for which it counts")
     if args.control is not None and args.pixel_sigma == 0:
         raise UserError("--pixel-sigma 0: wanted more than 0 with --control, whose pixels are measured")
     if args.plain and args.compress is not None:
@@ -451,10 +444,8 @@ def ground_under(args: argparse.Namespace, sensor: _Sensor) -> Ground:
     """The ground that the command line asks for, under the image."""
     model = sensor.model
     guess = float(sensor.bare.to_image.in_offset[2]) if isinstance(sensor.bare, Rpc) else 0.0
+    refuse_datum_without_raster(args)
     if not args.dem:
-        for name in ("dem_crs", "dem_datum"):
-            if getattr(args, name) is not None:
-                raise UserError(f"--{name.replace('_', '-')}: goes with --dem")
         h = guess if args.height is None else args.height
         ground = Ground(h, h, h, 1.0, f"height {h:.1f} m above the ellipsoid")
         if not np.isfinite(edge_of(model, ground)[0]).any():
@@ -554,11 +545,8 @@ def _metres(grid: MapGrid, lat: Array, lon: Array) -> float:
 def _error_map(args: argparse.Namespace, sensor: _Sensor) -> ErrorMap | None:
     if args.sigma is None:
         return None
-    stated = sensor.sigmas
-    position = stated.position_m if args.position_sigma is None else tuple(args.position_sigma)
-    attitude = stated.attitude_rad if args.attitude_sigma is None else tuple(np.radians(args.attitude_sigma).tolist())
-    pixel = stated.pixel if args.pixel_sigma is None else (args.pixel_sigma, args.pixel_sigma)
-    height = stated.height_m if args.height_sigma is None else args.height_sigma
+    stated = stated_sigmas(args, sensor.sigmas)
+    position, attitude, pixel, height = stated.position_m, stated.attitude_rad, stated.pixel, stated.height_m
     if not height and args.height_sigma is None and not args.mosaic:
         sensor.notes.append(NO_HEIGHT_SIGMA)
     bare, fit = sensor.bare, sensor.fit
@@ -585,7 +573,7 @@ def _error_map(args: argparse.Namespace, sensor: _Sensor) -> ErrorMap | None:
         )
     if not (any(pixel) or height or oriented or rpc_m2 or fit is not None or stated.time_s):
         raise UserError("--sigma: no sigma is known, wanted --height-sigma, --pixel-sigma, --position-sigma or others")
-    sensor_sigmas = Sigmas(position, attitude, stated.time_s, (0.0, 0.0), 0.0)
+    sensor_sigmas = replace(stated, pixel=(0.0, 0.0), height_m=0.0)
     matching = np.diag(np.square(pixel))
 
     def errors(line: Array, sample: Array, height_m: Array) -> tuple[Array, Array]:

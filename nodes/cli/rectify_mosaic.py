@@ -38,7 +38,7 @@ from ..batch.mosaic_layers import (
     layer_of_orthoimage,
 )
 from ..batch.rectification import Rectification, line_blocks, project_frame
-from ..errors import UserError
+from ..errors import UserError, flag
 from ..formats.geotiff import is_virtual
 from ..formats.height_raster import RasterFile
 from ..formats.json_text import json_text
@@ -100,7 +100,7 @@ def refuse_options(args: argparse.Namespace) -> None:
     """Refuse options of a mosaic without --mosaic."""
     for name in OPTIONS:
         if rectify_image.is_given(args, name):
-            raise UserError(f"--{name.replace('_', '-')}: goes with --mosaic")
+            raise UserError(f"{flag(name)}: goes with --mosaic")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -182,9 +182,7 @@ def _check(args: argparse.Namespace, outputs: Outputs) -> None:
         raise UserError("-o, --sigma, --source, --seam-lines, --stac: wanted different files")
     for name, of in _NOT_OF_MOSAIC.items():
         if rectify_image.is_given(args, name):
-            raise UserError(
-                f"--{name.replace('_', '-')}: is of one {of}; wanted orthoimages made with it, then --mosaic of these"
-            )
+            raise UserError(f"{flag(name)}: is of one {of}; wanted orthoimages made with it, then --mosaic of these")
     tile = TILE if args.tile is None else args.tile
     if args.tile is not None and (tile < LEAST_TILE or tile & (tile - 1)):
         raise UserError(f"--tile {args.tile}: wanted a power of two of at least {LEAST_TILE}")
@@ -248,12 +246,12 @@ def _refuse_without_effect(args: argparse.Namespace, kinds: set[str]) -> None:
     ):  # fmt: skip
         for name in names:
             if rectify_image.is_given(args, name) and not kinds & wanted:
-                raise UserError(f"--{name.replace('_', '-')}: goes with {words}, and there is none")
+                raise UserError(f"{flag(name)}: goes with {words}, and there is none")
     rectify_image.refuse_occlusions_of_level_ground(args)
     if args.sigma is None:
         for name in ("position_sigma", "attitude_sigma", "pixel_sigma", "height_sigma"):
             if rectify_image.is_given(args, name):
-                raise UserError(f"--{name.replace('_', '-')}: goes with --sigma FILE, for which it counts")
+                raise UserError(f"{flag(name)}: goes with --sigma FILE, for which it counts")
 
 
 def _refuse_inputs(args: argparse.Namespace, outputs: Outputs, kinds: list[tuple[str, Path, str | None]]) -> None:

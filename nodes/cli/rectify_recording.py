@@ -38,7 +38,7 @@ from ..formats.camera_json import read_camera_instead
 from ..formats.dem import dem_in_frame
 from ..recording.access import Recording
 from .heights_under import NO_HEIGHT_SIGMA
-from .locate import refraction_of
+from .location_options import refraction_of
 
 #: An orthoimage with more cells than this is refused: the mosaic is put together in memory.
 MOST_CELLS = 4e9

@@ -19,7 +19,7 @@ from ...solver.simulation.scenario import Simulation
 from .. import convert
 from ..batch.rectification import true_relief
 from ..batch.simulated_scenes import SceneSimulation, simulated_recording, write_simulated_scenes
-from ..errors import UserError
+from ..errors import UserError, flag
 from ..formats.geotiff import write_heights
 from ..formats.json_text import json_text
 from ..formats.new_file import new_file, refuse_unless_free
@@ -90,23 +90,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add(group: Any, option: Option) -> None:
-    flag = "--" + option.name.replace("_", "-")
+    name = flag(option.name)
     if option.kind is bool:
-        group.add_argument(flag, action="store_true", default=None, help=option.text)
+        group.add_argument(name, action="store_true", default=None, help=option.text)
         return
     if option.count == 0:
-        group.add_argument(flag, action="append", metavar="KEY=VALUE", help=option.text)
+        group.add_argument(name, action="append", metavar="KEY=VALUE", help=option.text)
         return
     shown = shown_default(option)
     text = f"{option.text} (default {shown})" if shown else option.text
     if option.name == "imu":
-        group.add_argument(flag, choices=sorted(GRADES), help=text)
+        group.add_argument(name, choices=sorted(GRADES), help=text)
     elif option.name == "control_sigma":
-        group.add_argument(flag, type=float, nargs="+", metavar="M", help=text)
+        group.add_argument(name, type=float, nargs="+", metavar="M", help=text)
     else:
         metavar = {int: "N", float: "X", str: "NAME"}[option.kind]
         group.add_argument(
-            flag, type=option.kind, nargs=None if option.count == 1 else option.count, metavar=metavar, help=text
+            name, type=option.kind, nargs=None if option.count == 1 else option.count, metavar=metavar, help=text
         )
 
 
@@ -150,7 +150,7 @@ def _simulate_scenes(args: argparse.Namespace, given: dict[str, Any]) -> int:
     other = [name for name, value in given.items() if value is not None and name not in goes]
     other += [name for name in ("epoch", "dem") if getattr(args, name) is not None]
     if other:
-        raise UserError(f"--{other[0].replace('_', '-')} does not go with --satellite")
+        raise UserError(f"{flag(other[0])} does not go with --satellite")
     checked({name: _single(value) for name, value in given.items() if value is not None})
     if args.place is not None and not (abs(args.place[0]) <= 90 and abs(args.place[1]) <= 360):
         raise UserError(f"--place {args.place[0]:g} {args.place[1]:g}: wanted latitude and longitude, degrees")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...solver.rectification.comparison import METHODS, Compared, Noise, compare
-from ..errors import UserError
+from ..errors import UserError, flag
 from ..formats.json_text import json_text
 from ..formats.new_file import new_file, refuse_unless_writable
 from ..formats.table import write_table
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError("--control: wanted at least 3, --check and --seeds: at least 1")
     for name in ("relief", "pixel_sigma", "ground_sigma", "height_sigma"):
         if not (np.isfinite(getattr(args, name)) and getattr(args, name) >= 0):
-            raise UserError(f"--{name.replace('_', '-')} {getattr(args, name)}: wanted a number of at least 0")
+            raise UserError(f"{flag(name)} {getattr(args, name)}: wanted a number of at least 0")
     if args.pixel_sigma == args.ground_sigma == 0:
         raise UserError("--pixel-sigma, --ground-sigma: wanted one above 0")
     for path in (args.csv, args.page):

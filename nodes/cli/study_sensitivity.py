@@ -12,6 +12,7 @@ draws the maps.
 from __future__ import annotations
 
 import argparse
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +22,6 @@ from typing import Any
 import numpy as np
 
 from ...solver.camera.sensors import preset
-from ...solver.geometry.ellipsoid import WGS84
 from ...solver.location.frame_camera import FrameCamera
 from ...solver.location.pushbroom import PushbroomSensor
 from ...solver.location.refraction import Refraction
@@ -49,6 +49,7 @@ from ..formats.json_text import json_text
 from ..formats.new_file import new_file, refuse_unless_writable
 from ..formats.satellite.read import read_scene
 from ..formats.table import write_table
+from .location_options import refraction_of, stated_sigmas
 
 EXAMPLE = "triline study sensitivity aster-vnir ads40 --attitude-sigma 0.001 0.001 0.001 --csv shares.csv"
 #: Scenes of the study without arguments.
@@ -57,12 +58,13 @@ _SCENES = ("bilsat", "aster-vnir", "ads40")
 _FLOWN_M, _GROUND_M, _AIR_CCD = 3000.0, 300.0, "N"
 #: Place below the satellite of simulated scenes, degrees.
 _PLACE_DEG = (36.0, 139.6)
-#: Sigmas where neither file nor command line states any: position m, attitude degrees, time s, pixel, height m. Tuned:
-#: a satellite with receiver and star tracker; an aircraft with GNSS and inertial measurement after processing.
-_SATELLITE = ((2.0, 2.0, 2.0), (5e-4, 5e-4, 1e-3), 1e-4, 0.3, 10.0)
-_AIR = ((0.05, 0.05, 0.1), (0.003, 0.003, 0.006), 0.0, 0.3, 0.5)
+_MDEG = math.radians(1e-3)
+#: Sigmas where neither file nor command line states any. Tuned: a satellite with receiver and star tracker; an aircraft
+#: with GNSS and inertial measurement after processing.
+_SATELLITE = Sigmas((2.0, 2.0, 2.0), (0.5 * _MDEG, 0.5 * _MDEG, 1.0 * _MDEG), 1e-4, (0.3, 0.3), 10.0)
+_AIR = Sigmas((0.05, 0.05, 0.1), (3.0 * _MDEG, 3.0 * _MDEG, 6.0 * _MDEG), 0.0, (0.3, 0.3), 0.5)
 #: A small satellite with GPS and star trackers whose frame camera is not calibrated in flight.
-_FRAME = ((50.0, 50.0, 50.0), (0.01, 0.01, 0.02), 0.0, 0.3, 15.0)
+_FRAME = Sigmas((50.0, 50.0, 50.0), (10.0 * _MDEG, 10.0 * _MDEG, 20.0 * _MDEG), 0.0, (0.3, 0.3), 15.0)
 #: Of the focal length, mm: usual of a laboratory calibration of an aerial camera; of a small satellite after launch.
 _FOCAL_MM, _FRAME_FOCAL_MM = 0.002, 0.02
 #: Height of the ground of the frame image above the ellipsoid, m.
@@ -175,35 +177,14 @@ def _scene(args: argparse.Namespace, name: str) -> _Scene:
         camera, found = read_frame(path, notes)
         stated = Sigmas(found["position_m"], found["attitude_rad"])
         if stated.any:  # a frame image has no keys for the others
-            _, _, _, pixel, height = _FRAME
-            stated = replace(stated, pixel=(pixel, pixel), height_m=height)
+            stated = replace(stated, pixel=_FRAME.pixel, height_m=_FRAME.height_m)
         return _frame(args, name, camera, _GROUND_M, stated, notes)
     return _satellite(args, name)
 
 
-def _sigmas(args: argparse.Namespace, usual: tuple[Any, ...], stated: Sigmas | None = None) -> Sigmas:
+def _sigmas(args: argparse.Namespace, usual: Sigmas, stated: Sigmas | None = None) -> Sigmas:
     """Those of the command line; else what the file states; else, where the file states none at all, the usual."""
-    position, attitude_deg, time_s, pixel, height = usual
-    of_file = stated if stated is not None and stated.any else None
-    pixels = (pixel, pixel) if of_file is None else of_file.pixel
-    attitude = np.radians(attitude_deg) if of_file is None else of_file.attitude_rad
-    if args.attitude_sigma is not None:
-        attitude = np.radians(args.attitude_sigma)
-    if args.pixel_sigma is not None:
-        pixels = (args.pixel_sigma, args.pixel_sigma)
-    if of_file is not None:
-        position, time_s, height = of_file.position_m, of_file.time_s, of_file.height_m
-    position = position if args.position_sigma is None else args.position_sigma
-    time_s = time_s if args.time_sigma is None else args.time_sigma
-    height = height if args.height_sigma is None else args.height_sigma
-    try:
-        about_x, about_y, about_z = (float(a) for a in attitude)
-        return Sigmas(tuple(position), (about_x, about_y, about_z), time_s, pixels, height)
-    except ValueError:
-        raise UserError(
-            "--position-sigma, --attitude-sigma, --time-sigma, --pixel-sigma, --height-sigma: wanted numbers of at "
-            "least 0"
-        ) from None
+    return stated_sigmas(args, stated if stated is not None and stated.any else usual)
 
 
 def _satellite(args: argparse.Namespace, name: str) -> _Scene:
@@ -224,9 +205,7 @@ def _satellite(args: argparse.Namespace, name: str) -> _Scene:
         assert isinstance(model, PushbroomSensor)
         sensor = model
     if args.refraction:
-        if abs(sensor.ellipsoid.semi_major_m / WGS84.semi_major_m - 1.0) > 1e-3:
-            raise UserError(f"{name}: --refraction knows the air of the Earth only, this is another planet")
-        sensor = sensor.with_refraction(Refraction(ellipsoid=sensor.ellipsoid))
+        sensor = sensor.with_refraction(refraction_of((), sensor.ellipsoid, name))
     column, row = _pixel(args, name, sensor.samples, sensor.lines)
     height = _GROUND_M if args.height is None else args.height
     try:

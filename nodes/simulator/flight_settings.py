@@ -21,7 +21,7 @@ from ...solver.simulation.misstated import World
 from ...solver.simulation.real_motion import HIGH_ALTITUDE_ERRORS, RealMotion, control_for
 from ...solver.simulation.scenario import ObservationPlan, Simulation, simulate, simulate_real_motion
 from .. import convert
-from ..errors import UserError
+from ..errors import UserError, flag
 from ..formats.named_camera import camera_named
 from .motion_track import motion_of
 from .world_settings import world_from
@@ -191,11 +191,11 @@ def _refuse_without_effect(values: Mapping[str, Any]) -> None:
     given = {name for name, value in values.items() if value is not False}
     for name, other in _GOES_WITH.items():
         if name in given and not values.get(other):
-            raise UserError(f"simulation: {_flag(name)} goes with {_flag(other)}")
+            raise UserError(f"simulation: {flag(name)} goes with {flag(other)}")
     for other, names in _GOES_NOT_WITH.items():
         for name in names:
             if name in given and values.get(other):
-                raise UserError(f"simulation: {_flag(name)} does not go with {_flag(other)}")
+                raise UserError(f"simulation: {flag(name)} does not go with {flag(other)}")
     if "outliers" in given and not values.get("ties", default(BY_NAME["ties"])):
         raise UserError("simulation: --outliers goes with --ties above 0: blunders are those of simulated tie points")
     strips, cross = values.get("strips", 1), values.get("cross", 0)
@@ -203,10 +203,6 @@ def _refuse_without_effect(values: Mapping[str, Any]) -> None:
         raise UserError("simulation: --sidelap goes with --strips, of at least 2")
     if "no_turns" in given and strips + cross == 1:
         raise UserError("simulation: --no-turns goes with --strips or --cross: a strip alone has no turns")
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
 
 
 def _checked(name: str, value: Any) -> Any:
