@@ -43,17 +43,12 @@ def write_report(recording: Path, output: Path) -> dict[str, Any]:
     from ..report.page import page
     from ..report.source import read
 
-    try:
-        with new_file(output) as part, open(part, "w", encoding="utf-8") as file:  # before the work begins
-            flight, held = read(recording)
-            if held.span_ns is None or not flight.counts:
-                raise UserError(f"{recording}: {_nothing(held)}")
-            result = analyse(flight, held)
-            file.write(page(flight, result))
-    except OSError as error:
-        if error.filename == str(recording):
-            raise
-        raise UserError(f"{output}: cannot be written: {(error.strerror or str(error)).lower()}") from None
+    with new_file(output) as part, open(part, "w", encoding="utf-8") as file:  # before the work begins
+        flight, held = read(recording)
+        if held.span_ns is None or not flight.counts:
+            raise UserError(f"{recording}: {_nothing(held)}")
+        result = analyse(flight, held)
+        file.write(page(flight, result))
     return result
 
 

@@ -326,7 +326,7 @@ class LiveFlight:
         if not getattr(self.args, "no_report", False):
             try:
                 result = self._report()
-            except UserError as error:  # on a full disk, for one: what was recorded is said all the same
+            except (UserError, OSError) as error:  # a full disk, for one: what was recorded is said all the same
                 result = {"no_report": str(error)}
         result.update(
             recordings=[str(path) for path in recordings], restarts=self.restarts,

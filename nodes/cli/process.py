@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import textwrap
 import time
@@ -18,7 +17,7 @@ from ..errors import UserError
 from ..formats.camera_json import read_camera_instead
 from ..formats.importable import refuse_importable
 from ..formats.json_text import json_text
-from ..formats.new_file import refuse_unless_file
+from ..formats.new_file import new_file, refuse_unless_writable
 from ..garbage_collection import RareCollections
 from ..last_problems import in_words
 from ..node import Node
@@ -98,35 +97,29 @@ def run(args: argparse.Namespace) -> int:
         notes.append(f"image lines and no tie point in it; '--nodes {more}' finds tie points")
     nodes: list[Node] = [build(registry.node_class(name), tables) for name in names]
     begun = time.monotonic()
-    part = args.output.with_name(args.output.name + ".part")
-    try:
-        with (
-            RecordingWriter(part, args.compression, platform=_platform(reader)) as writer,
-            progress("processing", args.quiet or args.json) as told,
-        ):
-            collections = RareCollections()
+    with (
+        new_file(args.output) as part,
+        RecordingWriter(part, args.compression, platform=_platform(reader)) as writer,
+        progress("processing", args.quiet or args.json) as told,
+    ):
+        collections = RareCollections()
 
-            def progressed(fraction: float) -> None:
-                collections.if_due()
-                if told is not None:
-                    told(fraction)
+        def progressed(fraction: float) -> None:
+            collections.if_due()
+            if told is not None:
+                told(fraction)
 
-            summary = process(
-                reader, nodes, writer.write_raw, progressed, apart=args.processes > 1, instead=instead,
-                copy=writer.write_recorded,
-            )  # fmt: skip
+        summary = process(
+            reader, nodes, writer.write_raw, progressed, apart=args.processes > 1, instead=instead,
+            copy=writer.write_recorded,
+        )  # fmt: skip
         if not summary.nodes:
             raise lacking(reader, f"nothing to process for {args.nodes}: {held_topics(reader)}")
         if not summary.outputs:
             raise lacking(reader, f"nothing came out: {_waiting(summary)}")
-        missing = ""
-        if NAVIGATOR in summary.nodes and not summary.outputs.keys() & set(POSES):
-            missing = f"no trajectory came out, so nothing is oriented: {_no_trajectory(summary)}"
-        os.replace(part, args.output)
-    except OSError as error:
-        raise UserError(f"{args.output}: cannot be written: {(error.strerror or str(error)).lower()}") from None
-    finally:
-        part.unlink(missing_ok=True)
+    missing = ""
+    if NAVIGATOR in summary.nodes and not summary.outputs.keys() & set(POSES):
+        missing = f"no trajectory came out, so nothing is oriented: {_no_trajectory(summary)}"
     seconds = time.monotonic() - begun
     for name, text in summary.failed.items():
         print(f"triline process: {reader.path}: {name} {text}", file=sys.stderr)
@@ -182,7 +175,7 @@ def at_pace(tables: Tables, pace: str) -> Tables:
 
 
 def _check(reader: RecordingReader, args: argparse.Namespace) -> None:
-    refuse_unless_file(args.output)
+    refuse_unless_writable(args.output)
     if not any(channel.known for channel in reader.channels.values()):
         raise UserError(f"{args.recording}: no topic of triline in it")
     if args.strict and (reader.damage or not reader.complete):

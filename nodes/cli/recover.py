@@ -11,7 +11,7 @@ from typing import Any
 from ...schemas.envelope import RawMessage
 from ..errors import UserError
 from ..formats.json_text import json_text
-from ..formats.new_file import refuse_unless_file
+from ..formats.new_file import new_file
 from ..recording.index import Channel
 from ..recording.reader import RecordingReader
 from ..recording.summary import topic_summaries
@@ -32,21 +32,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     readers = _in_order([RecordingReader(path, salvage=True) for path in args.recordings])
-    refuse_unless_file(args.output)
     counts = {"messages": 0, "repeated": 0}
-    part = args.output.with_name(args.output.name + ".part")
-    try:
+    with new_file(args.output) as part:
         with RecordingWriter(part, readers[0].compression) as writer:
             for channel, raw in _messages(readers, counts):
                 writer.write_raw(raw, channel.platform or None, channel.every)
         # gaps of parts may be filled by one another
         whole = readers[0] if len(readers) == 1 else RecordingReader(part)
         missing = {row.topic: row.gaps for row in topic_summaries(whole) if row.gaps}
-        os.replace(part, args.output)
-    except OSError as error:
-        raise UserError(f"{args.output}: cannot be written: {(error.strerror or str(error)).lower()}") from None
-    finally:
-        part.unlink(missing_ok=True)
     for reader in readers:
         look_again(reader)
     grow = [str(reader.path) for reader in readers if reader.grows and not reader.complete]

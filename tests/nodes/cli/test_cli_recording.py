@@ -350,11 +350,25 @@ def test_process_refuses_in_one_line(capsys, flight, tmp_path):
         ((flight, "-o", out, "--nodes", "navigator,viewer"), "no node 'viewer' that works on a recording, wanted navi"),
         ((flight, "-o", out, "--nodes", "adjuster"), "wanted navigator among --nodes, too"),
         ((flight, "-o", out, "--config", bad), "configuration [navigator]: wings is not known"),
-        ((flight, "-o", tmp_path / "no" / "out.mcap"), "no such file or directory"),
+        ((flight, "-o", tmp_path / "no" / "out.mcap"), f"out.mcap: no folder {tmp_path / 'no'}"),
     ):
         code, _, err = run(capsys, "process", *arguments)
         assert code == 1 and len(err.splitlines()) == 1 and text in err, err
     assert not out.exists() and not list(tmp_path.glob("*.part"))
+
+
+@pytest.mark.parametrize(
+    ("command", "reading"),
+    [("process", "cli.process.process"), ("recover", "cli.recover._messages"), ("analyze", "report.source.read")],
+)
+def test_what_cannot_be_read_is_told_as_that(flight, tmp_path, monkeypatch, capsys, command, reading):
+    def fails(*arguments, **options):
+        raise OSError(5, "Input/output error", str(flight))
+
+    out = tmp_path / "out"
+    monkeypatch.setattr(f"triline.nodes.{reading}", fails)
+    assert run(capsys, command, flight, "-o", out) == (1, "", f"triline {command}: {flight}: input/output error\n")
+    assert not list(tmp_path.iterdir())
 
 
 class Echo(Node):
