@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...solver.geometry.ellipsoid import WGS84
+from ...solver.location.in_image import in_image
 from ...solver.location.rpc import Rpc
 from ...solver.location.uncertainty import Sigmas, ground_derivatives, pixel_covariance
 from ...solver.rectification.error_map import derivatives_on_terrain
@@ -227,11 +228,10 @@ def _beyond_heights(rpc: Rpc, height_m: Array) -> list[str]:
 
 
 def _outside(model: Model, u: Array, v: Array) -> NDArray[np.object_]:
-    """A note for pixels outside the image; an RPC may not know its size, but where it begins."""
+    """A note for pixels outside the image."""
     note = np.full(len(u), "", dtype=object)
-    ends = (model.lines or np.inf) - 0.5, (model.samples or np.inf) - 0.5
     size = f" of {model.samples} columns and {model.lines} rows" if model.lines and model.samples else ""
-    note[~((u >= -0.5) & (u <= ends[0]) & (v >= -0.5) & (v <= ends[1]))] = f"outside the image{size}"
+    note[~in_image(np.column_stack([u, v]), model.lines, model.samples)] = f"outside the image{size}"
     return note
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..quantiles import norm
+from .in_image import in_image
 
 Array = NDArray[np.floating]
 
@@ -120,9 +121,7 @@ class CorrectedModel:
         pixel = self.model.inverse(lat, lon, height_m, margin_px + 2.0 * reach)
         pixel = pixel + self.bias.at(pixel)
         if self.lines and self.samples:
-            ends = np.array([self.lines, self.samples]) - 0.5 + margin_px
-            with np.errstate(invalid="ignore"):
-                pixel[~((pixel >= -0.5 - margin_px) & (pixel <= ends)).all(axis=1)] = np.nan
+            pixel[~in_image(pixel, self.lines, self.samples, margin_px)] = np.nan
         return pixel
 
     def direct(self, line: ArrayLike, sample: ArrayLike, height_m: ArrayLike) -> Array:

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .in_image import in_image
+
 Array = NDArray[np.floating]
 
 
@@ -37,7 +39,5 @@ class CroppedModel:
         if margin_px is None:
             return self.model.inverse(lat, lon, height_m) - [self.line, self.sample]
         pixel = self.model.inverse(lat, lon, height_m, margin_px) - [self.line, self.sample]
-        ends = np.array([self.lines, self.samples]) - 0.5 + margin_px
-        with np.errstate(invalid="ignore"):
-            pixel[~((pixel >= -0.5 - margin_px) & (pixel <= ends)).all(axis=1)] = np.nan
+        pixel[~in_image(pixel, self.lines, self.samples, margin_px)] = np.nan
         return pixel

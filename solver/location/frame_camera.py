@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..camera.sensors import brown_distortion
 from ..geometry.ellipsoid import WGS84, Ellipsoid
+from .in_image import in_image
 from .refraction import Refraction
 
 Array = NDArray[np.floating]
@@ -167,13 +168,12 @@ class FrameCamera:
             seen = visible & (d[:, 2] < 0) & (np.abs(tangent) < _WIDEST).all(axis=1)
             ideal = np.where(seen[:, None], tangent, 0.0) * self.focal_length_mm
             pixel = self.pixel_of(ideal)
-        ends = np.array([self.lines, self.samples]) - 0.5 + margin_px
         # far outside the image the distortion's polynomial may bring a point back in
         widest = 1.5 * np.linalg.norm(self._half_mm) + margin_px * self.pixel_mm.max()
         folded = np.linalg.norm(tangent, axis=1) * self.focal_length_mm > widest
         if self.distortion.any():
             folded |= ~_unfolded(self._distorted(ideal))
-        inside = ((pixel >= -0.5 - margin_px) & (pixel <= ends)).all(axis=1)
+        inside = in_image(pixel, self.lines, self.samples, margin_px)
         pixel[~(inside & seen & ~folded)] = np.nan
         return pixel
 

@@ -13,6 +13,7 @@ from ..geometry.ellipsoid import WGS84, Ellipsoid
 from ..geometry.rotation import cross
 from ..orbit.line_times import LineTimes
 from ..orbit.motion import FixedPoses, Motion, turned_on
+from .in_image import in_image
 from .look_directions import LookDirections
 from .refraction import Refraction
 
@@ -348,8 +349,7 @@ class PushbroomSensor:
                 break
         out = np.stack([u, v], axis=1)
         visible = _dot(self.ellipsoid.normal_and_height(P)[0], origin - P) > 0  # the side the satellite is above
-        ends = np.array([self.lines, self.samples]) - 0.5 + margin_px + _CONVERGED_PX
-        inside = ((out >= -0.5 - margin_px - _CONVERGED_PX) & (out <= ends)).all(axis=1)
+        inside = in_image(out, self.lines, self.samples, margin_px + _CONVERGED_PX)
         out[~(inside & seen & (moved <= _CONVERGED_PX) & visible)] = np.nan
         return out
 

@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .in_image import in_image
+
 Array = NDArray[np.floating]
 
 #: Powers of (L, P, H) of the 20 terms.
@@ -151,10 +153,8 @@ class Rpc:
         out = self.to_image.at(np.degrees(lon), np.degrees(lat), height_m)[:, ::-1].copy()
         if margin_px is None:
             return out
+        out[~in_image(out, self.lines, self.samples, margin_px)] = np.nan
         with np.errstate(invalid="ignore"):
-            # where the image begins is known, be its size known or not
-            ends = np.array([self.lines or np.inf, self.samples or np.inf]) - 0.5 + margin_px
-            out[~((out >= -0.5 - margin_px) & (out <= ends)).all(axis=1)] = np.nan
             beyond = np.abs(self.to_image.normalised(np.degrees(lon), np.degrees(lat), height_m)[:2]).max(axis=0)
             out[~(beyond <= _FARTHEST * (1.0 + margin_px / np.abs(self.to_image.out_scale).min()))] = np.nan
         return out

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..geometry.ellipsoid import WGS84, Ellipsoid
 from ..location.affine_bias import AffineBias, CorrectedModel
+from ..location.in_image import in_image
 from ..location.rpc import Rpc
 from ..models.base import direct_observations
 from .images import IMAGE, Equations, UnknownGroup
@@ -144,8 +145,7 @@ class ProjectiveFunctions:
         pixel, _, below = self.at(self.normalised(lat, lon, height_m))
         pixel[~(below > 0)] = np.nan
         if margin_px is not None and self.lines and self.samples:
-            ends = np.array([self.lines, self.samples]) - 0.5 + margin_px
-            pixel[~((pixel >= -0.5 - margin_px) & (pixel <= ends)).all(axis=1)] = np.nan
+            pixel[~in_image(pixel, self.lines, self.samples, margin_px)] = np.nan
         return pixel
 
     def direct(self, line: ArrayLike, sample: ArrayLike, height_m: ArrayLike) -> Array:
