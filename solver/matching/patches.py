@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, uniform_filter
 
+from ..cubic_weights import cubic_weights
+
 Array = NDArray[np.floating]
 Float32 = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -94,7 +96,8 @@ class Windows:
                 flat = at.reshape(k, -1)
                 none = np.take_along_axis(gaps, flat + taps, axis=1) == np.take_along_axis(gaps, flat, axis=1)
                 known &= none.reshape(known.shape)
-        total = _weighted(self.values, i, j, *((_cubic(a), _cubic(b)) if cubic else ((1 - a, a), (1 - b, b))))
+        weights = (cubic_weights(a), cubic_weights(b)) if cubic else ((1 - a, a), (1 - b, b))
+        total = _weighted(self.values, i, j, *weights)
         return total, known
 
     def touched(self, holes: Mask, line: Array, sample: Array) -> Mask:
@@ -155,7 +158,7 @@ def between(at: Array, size: int) -> Between:
     """Where bicubic values at rows or columns (k, ...) come from, of patches with so many of them."""
     at = np.clip(at, 1.0, size - 2.001)
     i = at.astype(np.int64)
-    return i - 1, _cubic((at - i).astype(np.float32))
+    return i - 1, cubic_weights((at - i).astype(np.float32))
 
 
 def interpolate_between(stack: Float32, rows: Between, columns: Between) -> Float32:
@@ -177,9 +180,3 @@ def _weighted(
             row += wv[b] * flat[a * m + b :].take(at)
         total += w * row
     return total
-
-
-def _cubic(s: Float32) -> tuple[Float32, Float32, Float32, Float32]:
-    s2, s3 = s * s, s * s * s
-    half = np.float32(0.5)
-    return (half * (2 * s2 - s3 - s), half * (3 * s3 - 5 * s2 + 2), half * (4 * s2 - 3 * s3 + s), half * (s3 - s2))

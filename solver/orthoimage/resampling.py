@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cubic_weights import cubic_weights
+
 Float32 = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 
@@ -57,9 +59,9 @@ def resample(
         low = _linear(flat, at, b)
         at += columns
         return low + a * (_linear(flat, at, b) - low), known
-    weights = _cubic(b)
+    weights = cubic_weights(b)
     total = np.zeros(n, dtype=np.float32)
-    for weight in _cubic(a):
+    for weight in cubic_weights(a):
         across = weights[0] * flat.take(at)
         for k in range(1, 4):
             across += weights[k] * flat.take(at + k)
@@ -75,10 +77,3 @@ def _linear(flat: NDArray[np.unsignedinteger], at: NDArray[np.intp], b: Float32)
     right *= b
     right += left
     return right
-
-
-def _cubic(s: Float32) -> tuple[Float32, Float32, Float32, Float32]:
-    s2 = s * s
-    s3 = s2 * s
-    half = np.float32(0.5)
-    return (half * (2 * s2 - s3 - s), half * (3 * s3 - 5 * s2 + 2), half * (4 * s2 - 3 * s3 + s), half * (s3 - s2))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cubic_weights import cubic_weights
 from .terrain import PORTION
 
 Float32 = NDArray[np.float32]
@@ -66,7 +67,7 @@ class Sampler:
             high *= self._a
             low += high
             return low
-        kernel = _cubic if self.method == "cubic" else _lanczos
+        kernel = cubic_weights if self.method == "cubic" else _lanczos
         across, down = kernel(self._b), kernel(self._a)
         total = np.zeros(self._at.shape, dtype=kind)
         for r, weight in enumerate(down):
@@ -105,13 +106,6 @@ def _linear(flat: NDArray[np.generic], at: NDArray[np.intp], b: Float32, kind: n
     right *= b
     right += left
     return right
-
-
-def _cubic(s: Float32) -> list[NDArray[Any]]:
-    s2 = s * s
-    s3 = s2 * s
-    half = np.float32(0.5)
-    return [half * (2 * s2 - s3 - s), half * (3 * s3 - 5 * s2 + 2), half * (4 * s2 - 3 * s3 + s), half * (s3 - s2)]
 
 
 def _lanczos(s: Float32) -> list[NDArray[Any]]:
