@@ -176,8 +176,9 @@ def write_dimap2(path: Path, truth: Truth, *, polynomial: bool = False, first_co
     return path
 
 
-def write_dimap1(path: Path, truth: Truth) -> Path:
-    """A DIMAP 1 document of level 1A: angles in the orbital frame of the velocity over the turning Earth."""
+def write_dimap1(path: Path, truth: Truth, mission: str = "SPOT 5") -> Path:
+    """A DIMAP 1 document of level 1A: angles in the orbital frame, for SPOT-5 that over the turning Earth."""
+    satellite, index = mission.split()
     t, ta = nodes(truth, 30.0, 150.0), nodes(truth, 0.125, 1.0)
     centre = truth.lines // 2
     points = "".join(
@@ -210,6 +211,9 @@ def write_dimap1(path: Path, truth: Truth) -> Path:
     path.write_text(f"""<?xml version="1.0" encoding="ISO-8859-1"?>
 <Dimap_Document>
 <Metadata_Id><METADATA_FORMAT version="1.1">DIMAP</METADATA_FORMAT></Metadata_Id>
+<Dataset_Sources><Source_Information><Scene_Source><MISSION>{satellite}</MISSION><MISSION_INDEX>{index}</MISSION_INDEX>
+<SCENE_PROCESSING_LEVEL>0</SCENE_PROCESSING_LEVEL></Scene_Source></Source_Information></Dataset_Sources>
+<Data_Processing><PROCESSING_LEVEL>1A</PROCESSING_LEVEL></Data_Processing>
 <Raster_Dimensions><NCOLS>{truth.samples}</NCOLS><NROWS>{truth.lines}</NROWS><NBANDS>1</NBANDS></Raster_Dimensions>
 <Data_Strip><Ephemeris><Points>{points}</Points></Ephemeris>
 <Satellite_Attitudes><Corrected_Attitudes><Corrected_Attitude>{angles}</Corrected_Attitude></Corrected_Attitudes>

@@ -87,6 +87,9 @@ def test_dimap2(change, match, tmp_path):
         (lambda s: s.replace("<OUT_OF_RANGE>N", "<OUT_OF_RANGE>Y"), "at least 2 attitudes that are in range"),
         (lambda s: without(s, "Look_Angles", 1), "Look_Angles: '1 of them', wanted look angles of at least 2"),
         (lambda s: s.replace("<DETECTOR_ID>7<", "<DETECTOR_ID>3<"), r"Look_Angles\[7\]/DETECTOR_ID: '3', wanted"),
+        (lambda s: s.replace("<PROCESSING_LEVEL>1A", "<PROCESSING_LEVEL>2A"), "PROCESSING_LEVEL: '2A', wanted 1A: im"),
+        (lambda s: s.replace("<MISSION>SPOT", "<MISSION>THEOS"), "Scene_Source/MISSION: 'THEOS', wanted SPOT"),
+        (lambda s: s.replace("<MISSION_INDEX>5", "<MISSION_INDEX>6"), "MISSION_INDEX: '6', wanted 1 to 5"),
     ],
 )
 def test_dimap1(change, match, tmp_path):

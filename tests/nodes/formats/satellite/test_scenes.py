@@ -23,6 +23,7 @@ WRITERS = {
     "dimap2-polynomial": lambda folder, truth: write_dimap2(folder / "scene.xml", truth, polynomial=True),
     "dimap2-columns": lambda folder, truth: write_dimap2(folder / "scene.xml", truth, first_col=101),
     "dimap1": lambda folder, truth: write_dimap1(folder / "scene.dim", truth),
+    "dimap1-spot4": lambda folder, truth: write_dimap1(folder / "scene.dim", truth, "SPOT 4"),
     "isd": lambda folder, truth: write_isd(folder / "scene.json", truth),
     "isd-inertial": lambda folder, truth: write_isd(folder / "scene.json", truth, inertial=True),
     "folder-angles": lambda folder, truth: write_folder(folder / "scene", truth),
@@ -54,6 +55,40 @@ def test_rays_of_the_file_pass_through_the_pixels_of_the_truth(name, tmp_path):
         located = sensor.direct(u, v, height)
         np.testing.assert_allclose(located[:, 2], height, atol=1e-6)
         assert truth.miss_m(u, v, located, inertial=name != "dimap1") < 1e-3
+
+
+def test_raw_attitudes_of_dimap_1_with_angular_speeds_between(tmp_path):
+    """As SPOT-1 to 4 have them: an angle at both ends, and speeds; a straight line between the ends is 10 m off."""
+    truth = Truth(tilt_deg=(0.0, 0.0, 0.0))
+    t = -1.0 + 0.125 * np.arange(49)
+
+    def pitch(at):
+        return 4e-5 + 2e-5 * np.sin(2.0 * np.pi * (at + 1.0) / 4.0)
+
+    def node(tag, at, value):
+        return (
+            f"<{tag}><TIME>{utc(at)}</TIME><YAW>0.0</YAW><PITCH>{value!r}</PITCH><ROLL>0.0</ROLL>"
+            f"<OUT_OF_RANGE>N</OUT_OF_RANGE></{tag}>"
+        )
+
+    speeds = np.gradient(pitch(t), 0.125)
+    ends = "".join(node("Angles", at, float(pitch(at))) for at in (t[0], t[-1]))
+    between = "".join(node("Angular_Speeds", at, float(v)) for at, v in zip(t[1:-1], speeds[1:-1], strict=True))
+    raw = (
+        f"<Raw_Attitudes><Aocs_Attitude><Angles_List>{ends}</Angles_List><Angular_Speeds_List>{between}"
+        "</Angular_Speeds_List></Aocs_Attitude></Raw_Attitudes>"
+    )
+    path = write_dimap1(tmp_path / "scene.dim", truth, "SPOT 4")
+    pattern = "<Corrected_Attitudes>.*</Corrected_Attitudes>"
+    path.write_text(re.sub(pattern, raw, path.read_text(), flags=re.DOTALL))
+    scene = read_scene(path)
+    assert scene.notes == ["scene.dim: no corrected attitudes, the raw ones of the attitude control are used"]
+    at = np.linspace(0.0, 4.0, 41)
+    centre_s = (truth.lines // 2 - 1) * truth.period_s
+    # the axes of the handbook are right, forward, up; pitch turns against the first
+    handbook = truth.orbital_frame(at)[:, :, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    turn = Rotation.from_matrix(np.swapaxes(handbook, 1, 2) @ scene.sensor.motion.at(at - centre_s).R_eb)
+    np.testing.assert_allclose(turn.as_rotvec(), np.stack([-pitch(at), 0 * at, 0 * at], axis=1), atol=1e-6)
 
 
 @pytest.mark.parametrize("place", PLACES)
