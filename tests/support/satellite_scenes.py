@@ -119,10 +119,17 @@ def _numbers(values) -> str:
     return " ".join(f"{x:.17g}" for x in np.atleast_1d(values))
 
 
-def write_dimap2(path: Path, truth: Truth, *, polynomial: bool = False, first_col: int = 1) -> Path:
-    """A DIMAP 2 document as products have it: quaternions in a list (SPOT-6/7), or polynomials (Pleiades)."""
+def write_dimap2(
+    path: Path, truth: Truth, *, polynomial: bool = False, first_col: int = 1, short_s: float | None = None
+) -> Path:
+    """A DIMAP 2 document as products have it: quaternions in a list (SPOT-6/7), or polynomials (Pleiades).
+
+    With ``short_s`` nodes are as dense as those of Pleiades Neo, and end so many seconds inside the scene.
+    """
     t, ta = nodes(truth, 10.0, 60.0), nodes(truth, 0.125, 1.0)
     end = (truth.lines - 1) * truth.period_s
+    if short_s is not None:
+        t = ta = np.arange(short_s, end - short_s, 0.0044)
     points = "".join(
         f"<Point><LOCATION_XYZ>{_numbers(p)}</LOCATION_XYZ><VELOCITY_XYZ>{_numbers(v)}</VELOCITY_XYZ>"
         f"<TIME>{utc(k)}</TIME></Point>"

@@ -1,4 +1,6 @@
-"""DIMAP 2: Pleiades and SPOT-6/7 scenes, in the form of products and in that of the maker's ground segment.
+"""DIMAP 2: Pleiades, Pleiades Neo and SPOT-6/7 scenes, as products and as of the maker's ground segment.
+
+Products have their polynomials in a file of their own, which the scene names: they are read where they lie beside it.
 
 Conventions. Rows and columns count from 1 at the centre of the first pixel. Line ``r`` is taken at the start of the
 time range plus ``(r - 1)`` line periods. Quaternions are scalar first and turn body to Earth-fixed; as polynomials they
@@ -11,9 +13,11 @@ aberration are in the attitudes already.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ....solver.location.look_directions import PolynomialLook
 from ....solver.location.pushbroom import PushbroomSensor
+from ....solver.location.rpc import Rpc
 from ....solver.orbit.attitude import Attitude, PolynomialAttitude, SplineAttitude
 from ....solver.orbit.line_times import UniformLineTimes
 from ....solver.orbit.motion import Motion
@@ -21,15 +25,24 @@ from ....solver.orbit.time_scales import tai_from_day, unix_from_tai
 from ...errors import UserError
 from .rpc_files import has_dimap_rpc, read_dimap_rpc
 from .scene import SatelliteScene, orbit_of, refuse_gap
-from .xml_file import Element, times_of
+from .xml_file import Element, read_xml, times_of
+
+Array = NDArray[np.floating]
 
 #: From (X, Y, 1) of the look polynomials to the body.
 _BODY_FROM_LOOK = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _DAY = 86_400 * 1_000_000_000
+#: Units of the line period, in seconds.
+_UNITS = {"s": 1.0, "second": 1.0, "ms": 1e-3, "millisecond": 1e-3, "us": 1e-6, "microsecond": 1e-6}
+#: Where a document names the file of its polynomials.
+_RPC_FILE = "Geoposition/Geoposition_Models/Rational_Function_Model/Component/COMPONENT_PATH"
 #: Files give times to the microsecond or better: how far the first and last line may lie outside, seconds.
 _MARGIN_S = 1.0
 #: The list of quaternions may begin and end this many of its steps inside the scene; tuned.
 _STEPS_BEYOND = 2.0
+#: Orbit and quaternions may begin and end so many seconds inside the scene, as those of Pleiades Neo do by some steps
+#: of 4 ms. Derived: an orbit that is continued by its velocity is off by 1 cm then.
+_BEYOND_S = 0.05
 
 
 def read_dimap2(root: Element) -> SatelliteScene:
@@ -40,14 +53,17 @@ def read_dimap2(root: Element) -> SatelliteScene:
     UserError : an element that is missing or has no sense, by its place in the document
     """
     notes: list[str] = []
+    size = root.need("Raster_Dimensions", "the size of the image", "Raster_Data/Raster_Dimensions")
+    lines, samples = size.integer("NROWS", low=1), size.integer("NCOLS", low=1)
+    rpc = _rpc(root, lines, samples)
     model = root.find("Geometric_Data/Refined_Model", "Geometric_Data/Sensor_Model_Characteristics")
     if model is None:
+        if rpc is not None:
+            return SatelliteScene("rpc", None, rpc)
         raise root.refuse(
             "Geometric_Data/Refined_Model", "the rigorous model of a SENSOR product (an ORTHO product has none)"
         )
-    size = root.need("Raster_Dimensions", "the size of the image", "Raster_Data/Raster_Dimensions")
-    lines, samples = size.integer("NROWS", low=1), size.integer("NCOLS", low=1)
-    start, period_s = _times(model)
+    start, period_s = _times(model, lines)
     last_ns = start + round((lines - 1) * period_s * 1e9)
     try:
         orbit = _orbit(model, start, last_ns, notes)
@@ -61,23 +77,33 @@ def read_dimap2(root: Element) -> SatelliteScene:
         )
     except ValueError as error:
         raise UserError(f"{root.path}: {model.where}: {error}") from None
-    rpc = read_dimap_rpc(root, lines, samples) if has_dimap_rpc(root) else None
     return SatelliteScene("dimap2", sensor, rpc, notes)
 
 
-def _times(model: Element) -> tuple[int, float]:
+def _rpc(root: Element, lines: int, samples: int) -> Rpc | None:
+    """The polynomials in a document, or in the file that it names."""
+    if has_dimap_rpc(root):
+        return read_dimap_rpc(root, lines, samples)
+    named = root.find(_RPC_FILE)
+    path = None if named is None else root.path.parent / named.node.get("href", "")
+    return read_dimap_rpc(read_xml(path), lines, samples) if path is not None and path.is_file() else None
+
+
+def _times(model: Element, lines: int) -> tuple[int, float]:
     """Time of the first line (``tai_ns``) and line period in seconds."""
     span = model.need("Time/Time_Range", "the time range of the image", "UTC_Sensor_Model_Range")
     period = model.need(
         "Time/Time_Stamp/LINE_PERIOD", "the line period", "Time/Time_Range/LINE_PERIOD", "SENSOR_LINE_PERIOD"
     )
-    unit = period.node.get("unit", "ms")
-    if unit not in ("ms", "s", "us"):
-        raise period.refuse("", "unit ms", f"unit {unit}")
-    period_s = period.number() * {"s": 1.0, "ms": 1e-3, "us": 1e-6}[unit]
-    if not period_s > 0:
+    value, unit, start = period.number(), period.node.get("unit"), span.time("START")
+    if not value > 0:
         raise period.refuse("", "a number above 0", period.text())
-    return span.time("START"), period_s
+    if unit is None:  # milliseconds of Pleiades, microseconds of SPOT-6/7: as the lines fill the time range
+        filled_s = (span.time("END") - start) * 1e-9 if span.find("END") is not None else value * 1e-3 * (lines - 1)
+        return start, min((value * s for s in _UNITS.values()), key=lambda p: abs(p * (lines - 1) - filled_s))
+    if unit.lower() not in _UNITS:
+        raise period.refuse("", f"one of the units {', '.join(_UNITS)}", f"unit {unit}")
+    return start, value * _UNITS[unit.lower()]
 
 
 def _orbit(model: Element, start: int, last_ns: int, notes: list[str]):
@@ -89,7 +115,25 @@ def _orbit(model: Element, start: int, last_ns: int, notes: list[str]):
     velocity = None
     if all(p.find("VELOCITY_XYZ", "VELOCITY_VALUES") is not None for p in points):
         velocity = np.array([p.numbers("VELOCITY_XYZ", 3, "VELOCITY_VALUES") for p in points])
+        times, position, velocity = _continued(times, position, velocity, start, last_ns)
     return orbit_of(model.path, place.where, times, position, velocity, start, notes)
+
+
+def _continued(
+    times: list[int], position: Array, velocity: Array, start: int, last_ns: int
+) -> tuple[list[int], Array, Array]:
+    """Nodes of an orbit with more of them, by the velocity, where the scene begins or ends a little beyond them."""
+    if len(times) < 2:
+        return times, position, velocity
+    order = np.argsort(times, kind="stable")
+    t, P, V = np.array(times, dtype=np.int64)[order], position[order], velocity[order]
+    step = max(int(np.median(np.diff(t))), 1)
+    missing = [max(int(beyond), 0) if beyond <= _BEYOND_S * 1e9 else 0 for beyond in (t[0] - start, last_ns - t[-1])]
+    before, after = (step * np.arange(1, -(-beyond // step) + 1) for beyond in missing)
+    ahead = np.concatenate([-before[::-1], after])
+    end = np.concatenate([np.zeros(len(before), dtype=int), np.full(len(after), -1)])
+    more = P[end] + ahead[:, None] * 1e-9 * V[end]
+    return [*times, *(t[end] + ahead).tolist()], np.vstack([position, more]), np.vstack([velocity, V[end]])
 
 
 def _attitude(model: Element, start: int, last_ns: int) -> Attitude:
@@ -114,7 +158,8 @@ def _attitude(model: Element, start: int, last_ns: int) -> Attitude:
     q = np.array([[e.number(f"Q{k}") for k in (1, 2, 3, 0)] for e in quaternions])
     order = np.argsort(times, kind="stable")
     t = (np.array(times, dtype=np.int64)[order] - start) * 1e-9
-    return SplineAttitude(t, q[order], margin_s=_STEPS_BEYOND * float(np.median(np.diff(t))))
+    margin_s = max(_STEPS_BEYOND * float(np.median(np.diff(t))), _BEYOND_S)
+    return SplineAttitude(t, q[order], margin_s=margin_s)
 
 
 def _second_of_day(offset_s: float, start: int, middle: int) -> float:

@@ -17,7 +17,7 @@ from .xml_file import Element, read_xml, text_start
 
 #: What is read: name -> words.
 KINDS = {
-    "dimap2": "DIMAP 2 (Pleiades, SPOT-6/7)",
+    "dimap2": "DIMAP 2 (Pleiades, Pleiades Neo, SPOT-6/7)",
     "dimap1": "DIMAP 1 (SPOT-1 to SPOT-5)",
     "isd": "community sensor model ISD (JSON)",
     "folder": "folder of a scene (ephemeris.csv, attitude.csv, line_times.csv, camera.json)",

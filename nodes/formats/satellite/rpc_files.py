@@ -2,7 +2,8 @@
 
 Pixels. RPC00B files (GeoTIFF, RPB, _RPC.TXT, geom) count lines and samples from 0 at the centre of the first pixel, as
 triline does (rasterio's ``rowcol`` counts from the corner and is half a pixel more). DIMAP 2 counts rows and columns
-from 1; DIMAP 3 (Pleiades Neo) as its domain of validity says, from 0.
+from 1, DIMAP 3 (Pleiades Neo) from 0. Where the polynomials hold may be wider than the image: it is the size of the
+image where it begins with the first pixel.
 """
 
 from __future__ import annotations
@@ -206,24 +207,20 @@ def read_dimap_rpc(root: Element, lines: int = 0, samples: int = 0) -> Rpc:
     """
     model = root.need(_DIMAP_PLACES[0], "rational polynomials", *_DIMAP_PLACES[1:])
     validity = model.find("RFM_Validity")
-    first, domain = (1.0, 1.0), None
-    if validity is not None and (domain := validity.find("ImagetoGround_Validity_Domain")) is not None:
-        first = domain.number("FIRST_COL"), domain.number("FIRST_ROW")
-    elif validity is not None:
-        domain = validity.find("Direct_Model_Validity_Domain")
+    first = 0.0 if model.find(_DIMAP_TO_IMAGE[1]) is not None else 1.0  # of DIMAP 3, of DIMAP 2
     to_image = _dimap_functions(model, validity, first, inverse=True)
     to_ground = None
     if model.find(*_DIMAP_TO_GROUND) is not None:
         to_ground = _dimap_functions(model, validity, first, inverse=False)
-    if not lines and domain is not None:
-        samples, lines = (int(domain.number(f"LAST_{a}") - f) + 1 for a, f in zip(("COL", "ROW"), first, strict=True))
+    if not lines and validity is not None:
+        domain = validity.find("ImagetoGround_Validity_Domain", "Direct_Model_Validity_Domain")
+        if domain is not None and all(domain.number(f"FIRST_{axis}") == first for axis in ("COL", "ROW")):
+            samples, lines = (int(domain.number(f"LAST_{axis}") - first) + 1 for axis in ("COL", "ROW"))
     return checked(root.path, Rpc(to_image, to_ground, lines, samples))
 
 
-def _dimap_functions(
-    model: Element, validity: Element | None, first: tuple[float, float], *, inverse: bool
-) -> RationalFunctions:
-    """The polynomials of one direction; ``first``: the numbers of the first column and row."""
+def _dimap_functions(model: Element, validity: Element | None, first: float, *, inverse: bool) -> RationalFunctions:
+    """The polynomials of one direction; ``first``: the number of the first column and row."""
     known, *others = _DIMAP_TO_IMAGE if inverse else _DIMAP_TO_GROUND
     place = model.need(known, "rational polynomials", *others)
     # in products of DIMAP 2 the direct model has SAMP for longitude and LINE for latitude
@@ -248,7 +245,7 @@ def _dimap_functions(
         else:
             part = validity.need(short, "offset and scale")
             of[short] = part.number("B"), part.number("A")
-    of["Col"], of["Row"] = ((of[axis][0] - f, of[axis][1]) for axis, f in zip(("Col", "Row"), first, strict=True))
+    of["Col"], of["Row"] = ((of[axis][0] - first, of[axis][1]) for axis in ("Col", "Row"))
     ground, image = ("Lon", "Lat"), ("Col", "Row")
     ins, outs = (ground, image) if inverse else (image, ground)
     try:

@@ -66,8 +66,8 @@ def write_dimap(path, rpc):
     return path
 
 
-def write_dimap3(path, rpc):
-    """As Pleiades Neo has them: other names, pixels from 0."""
+def write_dimap3(path, rpc, margins=(0, 0)):
+    """As Pleiades Neo has them: other names, pixels from 0; polynomials hold with margins of columns and rows."""
     text = write_dimap(path, rpc).read_text().replace("Inverse_Model>", "GroundtoImage_Values>")
     samples, lines = rpc.to_image.out_offset
     text = text.replace(f"<SAMP_OFF>{samples + 1:.17g}", f"<SAMP_OFF>{samples:.17g}")
@@ -76,7 +76,9 @@ def write_dimap3(path, rpc):
         f"<{axis}_{part}_COEFF_{k}>{float(k == (1 if part == 'DEN' else one)):g}</{axis}_{part}_COEFF_{k}>"
         for axis, one in (("LON", 2), ("LAT", 3)) for part in ("NUM", "DEN") for k in range(1, 21)
     )  # fmt: skip
-    domain = "<FIRST_COL>0</FIRST_COL><FIRST_ROW>0</FIRST_ROW><LAST_COL>5999</LAST_COL><LAST_ROW>19999</LAST_ROW>"
+    a, b = margins
+    domain = f"<FIRST_COL>{-a}</FIRST_COL><FIRST_ROW>{-b}</FIRST_ROW>"
+    domain += f"<LAST_COL>{5999 + a}</LAST_COL><LAST_ROW>{19999 + b}</LAST_ROW>"
     direct = f"<ImagetoGround_Values>{direct}</ImagetoGround_Values>"
     domain = f"<ImagetoGround_Validity_Domain>{domain}</ImagetoGround_Validity_Domain>"
     path.write_text(text.replace("<RFM_Validity>", f"{direct}<RFM_Validity>{domain}"))
@@ -103,9 +105,13 @@ def _text(path, rpc):
     return path
 
 
+def _dimap3_with_margins(path, rpc):
+    return write_dimap3(path, rpc, (4900, 4510))
+
+
 WRITERS = {
     "a.tif": write_geotiff, "a.RPB": _rpb, "a_RPC.TXT": _text, "a.geom": write_geom, "RPC_a.XML": write_dimap,
-    "RPC_PNEO.XML": write_dimap3, "a.vrt": write_copy, "a.pix": write_copy,
+    "RPC_PNEO.XML": write_dimap3, "RPC_PNEO4.XML": _dimap3_with_margins, "a.vrt": write_copy, "a.pix": write_copy,
 }  # fmt: skip
 
 
@@ -121,6 +127,36 @@ def test_the_same_polynomials_come_back(name, rpc, tmp_path):
 def test_size_of_an_image_of_dimap_3(rpc, tmp_path):
     back = read_scene(write_dimap3(tmp_path / "RPC_PNEO.XML", rpc)).model()
     assert (back.lines, back.samples) == (20_000, 6_000) and back.to_ground is not None
+
+
+def test_polynomials_of_dimap_that_hold_beyond_the_image_do_not_tell_its_size(rpc, tmp_path):
+    """As those of Pleiades Neo, and of some scenes of Pleiades: the margin is not part of the image."""
+    back = read_scene(_dimap3_with_margins(tmp_path / "RPC_PNEO.XML", rpc)).model()
+    assert (back.lines, back.samples) == (0, 0)
+    path = write_dimap(tmp_path / "RPC_PHR.XML", rpc)
+    for first, size in ((1, (42248, 39208)), (-27, (0, 0))):
+        ends = f"<FIRST_ROW>{first}</FIRST_ROW><FIRST_COL>{first}</FIRST_COL><LAST_ROW>42248</LAST_ROW>"
+        domain = f"<Direct_Model_Validity_Domain>{ends}<LAST_COL>39208</LAST_COL></Direct_Model_Validity_Domain>"
+        (tmp_path / "RPC_a.XML").write_text(path.read_text().replace("<RFM_Validity>", f"<RFM_Validity>{domain}"))
+        back = read_scene(tmp_path / "RPC_a.XML").model()
+        assert (back.lines, back.samples) == size
+
+
+def test_polynomials_that_a_scene_of_dimap_2_names(rpc, tmp_path):
+    """Products have them in a file of their own beside that of the scene, which knows the size of the image."""
+    scene = write_dimap2(tmp_path / "DIM_a.XML", Truth())
+    place = "<Component><COMPONENT_PATH href='RPC_a.XML'/></Component>"
+    model = f"<Geoposition_Models><Rational_Function_Model>{place}</Rational_Function_Model></Geoposition_Models>"
+    text = scene.read_text().replace("<Geometric_Data>", f"<Geoposition>{model}</Geoposition><Geometric_Data>")
+    scene.write_text(text)
+    assert read_scene(scene).rpc is None  # the file is not there
+    write_dimap(tmp_path / "RPC_a.XML", rpc)
+    for name, kind in (("Geometric_Data", "dimap2"), ("Other_Data", "rpc")):  # with a rigorous model, and without
+        scene.write_text(text.replace("Geometric_Data", name))
+        found = read_scene(scene)
+        back = found.model("rpc")
+        assert (found.kind, back.lines, back.samples) == (kind, 20_000, 6_000)
+        np.testing.assert_array_equal(back.to_image.coefficients, rpc.to_image.coefficients)
 
 
 @pytest.mark.parametrize("errors", [(3.0, 0.25), (0.0, 0.0)])

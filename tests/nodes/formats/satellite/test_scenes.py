@@ -57,6 +57,29 @@ def test_rays_of_the_file_pass_through_the_pixels_of_the_truth(name, tmp_path):
         assert truth.miss_m(u, v, located, inertial=name != "dimap1") < 1e-3
 
 
+def test_orbit_and_attitudes_of_dimap_2_that_end_inside_the_scene(tmp_path):
+    """Those of Pleiades Neo begin some of their steps of 4 ms after the first line."""
+    truth = Truth(lines=4000)
+    sensor = read_scene(write_dimap2(tmp_path / "scene.xml", truth, short_s=0.012)).model("rigorous")
+    u, v = pixels(sensor, 21)
+    assert truth.miss_m(u, v, sensor.direct(u, v, 100.0)) < 2e-3
+    with pytest.raises(UserError, match=r"lines are taken from .* but the orbit is given from"):
+        read_scene(write_dimap2(tmp_path / "short.xml", truth, short_s=0.06))
+
+
+@pytest.mark.parametrize("unit", [None, "ms", "microsecond", "us", "s"])
+def test_units_of_the_line_period_of_dimap_2(unit, tmp_path):
+    """Milliseconds of Pleiades, microseconds of SPOT-6/7; some files do not tell."""
+    path = write_dimap2(tmp_path / "scene.xml", Truth())
+    text, said = path.read_text(), '<LINE_PERIOD unit="ms">0.2<'
+    assert said in text
+    for number in ("0.2", "200") if unit is None else (str({"s": 2e-4, "ms": 0.2}.get(unit, 200.0)),):
+        attribute = f" unit='{unit}'" if unit else ""
+        path.write_text(text.replace(said, f"<LINE_PERIOD{attribute}>{number}<"))
+        times = read_scene(path).model("rigorous").line_times
+        np.testing.assert_allclose(times.time_of([0.0, 1000.0]), [0.0, 0.2])
+
+
 def test_raw_attitudes_of_dimap_1_with_angular_speeds_between(tmp_path):
     """As SPOT-1 to 4 have them: an angle at both ends, and speeds; a straight line between the ends is 10 m off."""
     truth = Truth(tilt_deg=(0.0, 0.0, 0.0))
