@@ -22,7 +22,7 @@ from ....solver.orbit.attitude import AnglesAttitude
 from ....solver.orbit.line_times import UniformLineTimes
 from ....solver.orbit.motion import Motion
 from ...errors import UserError
-from .scene import SatelliteScene, orbit_of, refuse_gap
+from .scene import SatelliteScene, corner_notes, orbit_of, refuse_gap
 from .xml_file import Element, times_of
 
 Array = NDArray[np.floating]
@@ -74,6 +74,7 @@ def read_dimap1(root: Element) -> SatelliteScene:
         )
     except ValueError as error:
         raise UserError(f"{root.path}: {strip.where}: {error}") from None
+    notes += corner_notes(sensor, root.find("Dataset_Frame"), "FRAME_")
     return SatelliteScene("dimap1", sensor, None, notes)
 
 

@@ -24,7 +24,7 @@ from ....solver.orbit.motion import Motion
 from ....solver.orbit.time_scales import tai_from_day, unix_from_tai
 from ...errors import UserError
 from .rpc_files import has_dimap_rpc, read_dimap_rpc
-from .scene import SatelliteScene, orbit_of, refuse_gap
+from .scene import SatelliteScene, corner_notes, orbit_of, refuse_gap
 from .xml_file import Element, read_xml, times_of
 
 Array = NDArray[np.floating]
@@ -77,6 +77,7 @@ def read_dimap2(root: Element) -> SatelliteScene:
         )
     except ValueError as error:
         raise UserError(f"{root.path}: {model.where}: {error}") from None
+    notes += corner_notes(sensor, root.find("Dataset_Content/Dataset_Extent", "Product_Frame/Dataset_Frame"))
     return SatelliteScene("dimap2", sensor, rpc, notes)
 
 

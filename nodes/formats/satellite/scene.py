@@ -17,6 +17,7 @@ from ....solver.orbit.ephemeris import InterpolatedOrbit
 from ....solver.orbit.time_scales import iso_utc
 from ....solver.scene_adjustment.rigorous import LensView
 from ...errors import UserError
+from .xml_file import Element
 
 Array = NDArray[np.floating]
 
@@ -25,6 +26,10 @@ GAP_STEPS = 3.5
 #: Largest difference between stated velocities and the slope of the positions at which they count as the same, m/s.
 #: Tuned: velocities against the stars differ by hundreds.
 SAME_VELOCITY_M_S = 1.0
+#: Corners that lie further beside the rays of their pixels are told, metres. Tuned: orbits and attitudes are better.
+CORNER_OFF_M = 1000.0
+#: Heights of ground, metres.
+_GROUND_M = (-500.0, 9000.0)
 #: Half axes that differ by less are the same, metres; GRS 80 has those of WGS 84 to a tenth of a millimetre.
 _SAME_AXIS_M = 1e-3
 #: Nodes that are left out in turn to judge velocities, and how many on each side they are met by.
@@ -193,3 +198,39 @@ def refuse_gap(path: Path, where: str, tai_ns: list[int], first_ns: int, last_ns
             f"{path}: {where}: gap from {iso_utc(int(t[k]))} to {iso_utc(int(t[k + 1]))} while lines were taken, "
             f"wanted a value every {np.median(steps) * 1e-9:g} s"
         )
+
+
+def corner_notes(sensor: PushbroomSensor, frame: Element | None, prefix: str = "") -> list[str]:
+    """A note where pixels are not located where the file itself says that corners of the image lie.
+
+    Parameters
+    ----------
+    frame : element with a ``Vertex`` a corner, None for none: row and column from 1, latitude and longitude in degrees
+    prefix : of the names in a vertex
+    """
+    names = [f"{prefix}{name}" for name in ("ROW", "COL", "LAT", "LON")]
+    corners = [] if frame is None else [Element(frame.path, v, frame.where) for v in frame.node.findall("Vertex")]
+    corners = [vertex for vertex in corners if all(vertex.find(name) is not None for name in names)]
+    if not corners:
+        return []
+    row, column, lat, lon = np.array([[vertex.number(name) for name in names] for vertex in corners]).T
+    # from the file's corner to the ray at the lowest and the highest ground, and to where it is nearest between them
+    try:
+        low, high = (
+            sensor.ground(row - 1.0, column - 1.0, h)
+            - sensor.ellipsoid.cartesian(np.radians(lat), np.radians(lon), np.full(len(lat), h))
+            for h in _GROUND_M
+        )
+    except ValueError:  # a row that is not in the image
+        return []
+    way = high - low
+    square = np.maximum(np.einsum("ni,ni->n", way, way), 1e-9)
+    share = np.clip(-np.einsum("ni,ni->n", low, way) / square, 0.0, 1.0)
+    off = np.linalg.norm(low + share[:, None] * way, axis=1)
+    if not (off > CORNER_OFF_M).any():
+        return []
+    k = int(np.nanargmax(off))
+    return [
+        f"{corners[k].path.name}: row {row[k]:g}, column {column[k]:g} lies {off[k] / 1000.0:.3g} km from where the "
+        "file says that this corner is: what is located by its orbit and attitude may be wrong"
+    ]

@@ -80,6 +80,34 @@ def test_units_of_the_line_period_of_dimap_2(unit, tmp_path):
         np.testing.assert_allclose(times.time_of([0.0, 1000.0]), [0.0, 0.2])
 
 
+@pytest.mark.parametrize("kind", ["dimap1", "dimap2-list"])
+def test_corners_that_a_file_gives_elsewhere_than_its_orbit_and_attitude_are_told(kind, tmp_path):
+    """Of ground up to 9000 m nothing is told; of corners 5 km off it is, as of SPOT-4 read as SPOT-5."""
+    path = WRITERS[kind](tmp_path, Truth(tilt_deg=(30.0, 5.0, 0.0)))
+    text, sensor = path.read_text(), read_scene(path).model("rigorous")
+    prefix, place, end = {
+        "dimap1": ("FRAME_", "Dataset_Frame", "<Raster_Dimensions>"),
+        "dimap2-list": ("", "Dataset_Content><Dataset_Extent", "<Raster_Data>"),
+    }[kind]
+    rows, columns = np.array([0.0, 0.0, 19999.0]), np.array([0.0, 5999.0, 5999.0])
+    for height, shift_deg, told in ((0.0, 0.0, False), (9000.0, 0.0, False), (0.0, 0.05, True)):
+        corners = "".join(
+            "<Vertex>"
+            + "".join(
+                f"<{prefix}{name}>{value:.12g}</{prefix}{name}>"
+                for name, value in (("ROW", u + 1), ("COL", v + 1), ("LAT", lat + shift_deg), ("LON", lon))
+            )
+            + "</Vertex>"
+            for u, v, (lat, lon, _) in zip(rows, columns, np.degrees(sensor.direct(rows, columns, height)), strict=True)
+        )
+        close = "></".join(reversed(place.split("><")))
+        path.write_text(text.replace(end, f"<{place}>{corners}</{close}>{end}"))
+        notes = read_scene(path).notes
+        assert len(notes) == told
+        if told:
+            assert re.search(r"scene\.\w+: row \d+, column \d+ lies 5\.\d+ km from where the file says", notes[0])
+
+
 def test_raw_attitudes_of_dimap_1_with_angular_speeds_between(tmp_path):
     """As SPOT-1 to 4 have them: an angle at both ends, and speeds; a straight line between the ends is 10 m off."""
     truth = Truth(tilt_deg=(0.0, 0.0, 0.0))
