@@ -105,6 +105,8 @@ def read_rpb(path: Path) -> Rpc:
     found: dict[str, str] = {}
     for name, value in re.findall(r"(\w+)[ \t]*=[ \t]*(\([^)]*\)|[^;\r\n]*)", text):
         found.setdefault(name.lower(), value)
+    if "RPC00A" in found.get("specid", "").upper():
+        raise UserError(f"{path}: SpecId: {found['specid']}, wanted RPC00B (the order of terms)")
     values: dict[str, float] = {}
     for name in _NAMES:
         for what, word in (("OFF", "Offset"), ("SCALE", "Scale")):

@@ -208,6 +208,7 @@ def test_geom_of_ossim(name):
         ("a.RPB", lambda s: s[: s.index("sampDenCoef") + 60], "sampDenCoef: .*wanted 20 numbers"),
         ("a_RPC.TXT", lambda s: s.replace("SAMP_SCALE: ", "SAMP_SCALE: x"), "samp_scale: 'x.*wanted a number"),
         ("a_RPC.TXT", lambda s: s.replace("LINE_DEN_COEFF_7:", "LINE_DEN_COEFF_77:"), "line_den_coeff_07: missing"),
+        ("a.RPB", lambda s: s.replace("RPC00B", "RPC00A"), 'SpecId: "RPC00A", wanted RPC00B'),
         ("a.geom", lambda s: s.replace("polynomial_format:  B", "polynomial_format:  A"), "'A', wanted B"),
         ("RPC_a.XML", lambda s: s.replace("LINE_NUM_COEFF_3>", "X>"), "LINE_NUM_COEFF_3: missing, wanted a number"),
         ("RPC_a.XML", lambda s: s.replace("<LAT_SCALE>", "<LAT_SCALE>0 "), "LAT_SCALE.*wanted a number"),
