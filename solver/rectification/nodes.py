@@ -30,11 +30,10 @@ def lagrange(nodes: Array, x: Array) -> Array:
     scale = max(float(nodes[-1] - nodes[0]), 1.0) / 4.0
     weight = np.array([1.0 / np.prod((nodes[k] - np.delete(nodes, k)) / scale) for k in range(n)])
     apart = x[:, None] - nodes[None]
-    exact = np.abs(apart) < 1e-12
-    terms = weight / np.where(exact, 1.0, apart)
-    out = terms / terms.sum(axis=1, keepdims=True)
-    hit = exact.any(axis=1)
-    out[hit] = exact[hit]
+    out = (np.abs(apart) < 1e-12).astype(float)
+    between = ~out.any(axis=1)
+    terms = weight / apart[between]
+    out[between] = terms / terms.sum(axis=1, keepdims=True)
     return out
 
 

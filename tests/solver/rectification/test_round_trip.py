@@ -15,6 +15,7 @@ from triline.solver.location.frame_camera import FrameCamera
 from triline.solver.location.refraction import Refraction
 from triline.solver.rectification.cell_to_pixel import HeightsOfTile, Tile, pixels_of_tile
 from triline.solver.rectification.grid import MapGrid, default_crs
+from triline.solver.rectification.nodes import lagrange, places
 from triline.solver.rectification.occlusion import ground_slopes
 from triline.solver.rectification.pixel_to_cell import meet_terrain, mesh_cells
 from triline.solver.rectification.sampled import metres_a_radian
@@ -286,3 +287,13 @@ def test_an_image_smaller_than_a_tile_without_anything_around_it(tmp_path):
     row, column = np.mgrid[0 : grid.rows, 0 : grid.columns]
     true = model.inverse(*grid.where(column.ravel(), row.ravel()), 0.0, 0.0)
     assert seen == np.isfinite(true[:, 0]).sum() > 200
+
+
+@pytest.mark.parametrize("length", [2, 3, 16, 64])
+@pytest.mark.parametrize("count", [2, 3, 9])
+def test_polynomials_through_nodes_of_a_tile(length, count):
+    """Exact for polynomials of that order, at nodes and between; without a warning of NumPy in a tile of two cells."""
+    nodes, cells = places(length, count), np.arange(length, dtype=float)
+    with np.errstate(all="raise"):
+        weights = lagrange(nodes, cells)
+    np.testing.assert_allclose(weights @ (nodes / length) ** (count - 1), (cells / length) ** (count - 1), atol=1e-12)
