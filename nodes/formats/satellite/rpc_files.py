@@ -2,8 +2,8 @@
 
 Pixels. RPC00B files (GeoTIFF, RPB, _RPC.TXT, geom) count lines and samples from 0 at the centre of the first pixel, as
 triline does (rasterio's ``rowcol`` counts from the corner and is half a pixel more). DIMAP 2 counts rows and columns
-from 1, DIMAP 3 (Pleiades Neo) from 0. Where the polynomials hold may be wider than the image: it is the size of the
-image where it begins with the first pixel.
+from 1, DIMAP 3 (Pleiades Neo) from 0. Where the polynomials hold may be wider than the image, whose size the file of
+the scene beside them tells; without that file it is the size of the image where it begins with the first pixel.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ....solver.location.rpc import RationalFunctions, Rpc
 from ...errors import UserError
 from ..new_file import new_file
 from ..raster_open import open_raster
-from .xml_file import Element, float_of
+from .xml_file import Element, float_of, read_xml
 
 #: RPC00B names of offsets and scales, in the order longitude, latitude, height, sample, line.
 _NAMES = ("LONG", "LAT", "HEIGHT", "SAMP", "LINE")
@@ -214,11 +214,22 @@ def read_dimap_rpc(root: Element, lines: int = 0, samples: int = 0) -> Rpc:
     to_ground = None
     if model.find(*_DIMAP_TO_GROUND) is not None:
         to_ground = _dimap_functions(model, validity, first, inverse=False)
+    if not lines:
+        lines, samples = _size_beside(root.path)
     if not lines and validity is not None:
         domain = validity.find("ImagetoGround_Validity_Domain", "Direct_Model_Validity_Domain")
         if domain is not None and all(domain.number(f"FIRST_{axis}") == first for axis in ("COL", "ROW")):
             samples, lines = (int(domain.number(f"LAST_{axis}") - first) + 1 for axis in ("COL", "ROW"))
     return checked(root.path, Rpc(to_image, to_ground, lines, samples))
+
+
+def _size_beside(path: Path) -> tuple[int, int]:
+    """Rows and columns by the file of the scene, ``DIM_a.XML`` beside ``RPC_a.XML``; 0 and 0 where there is none."""
+    scene = path.with_name(f"DIM_{path.name[4:]}")
+    if not path.name.upper().startswith("RPC_") or not scene.is_file():
+        return 0, 0
+    size = read_xml(scene).find("Raster_Data/Raster_Dimensions")
+    return (0, 0) if size is None else (size.integer("NROWS", low=1), size.integer("NCOLS", low=1))
 
 
 def _dimap_functions(model: Element, validity: Element | None, first: float, *, inverse: bool) -> RationalFunctions:

@@ -131,8 +131,12 @@ def test_size_of_an_image_of_dimap_3(rpc, tmp_path):
 
 def test_polynomials_of_dimap_that_hold_beyond_the_image_do_not_tell_its_size(rpc, tmp_path):
     """As those of Pleiades Neo, and of some scenes of Pleiades: the margin is not part of the image."""
-    back = read_scene(_dimap3_with_margins(tmp_path / "RPC_PNEO.XML", rpc)).model()
+    path = _dimap3_with_margins(tmp_path / "RPC_PNEO.XML", rpc)
+    back = read_scene(path).model()
     assert (back.lines, back.samples) == (0, 0)
+    write_dimap2(tmp_path / "DIM_PNEO.XML", Truth(lines=900, samples=800))  # of the scene, which tells it
+    back = read_scene(path).model()
+    assert (back.lines, back.samples) == (900, 800)
     path = write_dimap(tmp_path / "RPC_PHR.XML", rpc)
     for first, size in ((1, (42248, 39208)), (-27, (0, 0))):
         ends = f"<FIRST_ROW>{first}</FIRST_ROW><FIRST_COL>{first}</FIRST_COL><LAST_ROW>42248</LAST_ROW>"
