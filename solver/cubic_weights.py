@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
+Float32 = NDArray[np.floating]
 
 
 def cubic_weights(s: Float32) -> tuple[Float32, Float32, Float32, Float32]:
