@@ -185,8 +185,8 @@ def open_strips(
         if pixels and pixels != image.samples:
             wanted = f"{pixels} as CCD line {view} of the camera has pixels"
             raise UserError(f"{image.path}: {image.samples} samples, wanted {wanted}")
-        for first in list(views.values())[:1]:
-            _refuse_other_lines(cubes, first)
+        if views:
+            _refuse_other_lines(cubes, next(iter(views.values())))
         views[view], bands[view] = cubes, band or given.band
     if not views:
         raise UserError("--lines: no image, wanted VIEW=FILE, as in F=forward.img,N=nadir.img")
@@ -196,7 +196,7 @@ def open_strips(
         lost = [line.id for line in camera.lines if line.id not in views]
         notes.append(f"no image of the CCD lines {', '.join(lost)} of the camera")
     cubes = next(iter(views.values()))
-    time_ns, equal = _times(given, cubes, pose_times_ns, notes)
+    time_ns, rate_hz = _times(given, cubes, pose_times_ns, notes), given.first[1] if given.first else None
     ends = np.cumsum([cube.lines for cube in cubes])
     late = time_ns[ends[:-1]] - time_ns[ends[:-1] - 1] > STRIP_SILENT_S * SECOND_NS
     parts = np.split(np.arange(len(cubes)), np.flatnonzero(late) + 1)
@@ -206,7 +206,7 @@ def open_strips(
         grey = {view: GreyImage(image, image.weights(bands[view]), given.span) for view, image in images.items()}
         times = time_ns[ends[part[0]] - cubes[part[0]].lines : ends[part[-1]]]
         name = given.strip or cubes[0].path.stem if len(parts) == 1 else given.strip + strip_name(int(times[0]))
-        strips.append(_strip_of(name, grey, times, given.first[1] if equal and given.first else None, notes))
+        strips.append(_strip_of(name, grey, times, rate_hz, notes))
         notes = []
     return strips
 
@@ -219,7 +219,7 @@ def strip_name(utc_ns: int) -> str:
 def _strip_of(
     id: str, views: dict[str, GreyImage], time_ns: NDArray[np.int64], rate_hz: float | None, notes: list[str]
 ) -> ImageStrip:
-    """A strip of images; of lines that are equally spaced by construction with their rate."""
+    """A strip of images; ``rate_hz`` of lines that are equally spaced by construction."""
     lines = len(time_ns)
     if lines < 2:
         raise UserError(f"{next(iter(views.values())).image.path}: {lines} line, wanted at least 2")
@@ -312,8 +312,8 @@ def _view(name: str, path: Path, camera: LineCamera | None) -> str:
 
 def _times(
     given: LinesGiven, cubes: list[ImageFile], pose_times_ns: NDArray[np.int64] | None, notes: list[str]
-) -> tuple[NDArray[np.int64], bool]:
-    """Times of the lines (n,), and whether they are equally spaced by construction."""
+) -> NDArray[np.int64]:
+    """Times of the lines (n,)."""
     lines, path = sum(cube.lines for cube in cubes), cubes[0].path
     if given.times is not None and given.first is not None:
         raise UserError(f"{given.times}: line times and a first time with a rate, wanted one of them")
@@ -322,11 +322,11 @@ def _times(
         if not 0 < rate < np.inf:
             raise UserError(f"--line-rate {rate:g}, wanted more than 0 Hz")
         start = instant_ns(text, "--first-time")
-        return start + np.rint(np.arange(lines) * (1e9 / rate)).astype(np.int64), True
+        return start + np.rint(np.arange(lines) * (1e9 / rate)).astype(np.int64)
     if given.times is not None:
-        return _of_file(given.times, path, lines, given.day, notes), False
+        return _of_file(given.times, path, lines, given.day, notes)
     if times_beside(path) is not None:
-        return _beside(cubes, given.day, notes), False
+        return _beside(cubes, given.day, notes)
     if pose_times_ns is None:
         raise UserError(
             f"{path}: times of its lines are missing, wanted --line-times CSV, or --first-time and --line-rate"
@@ -334,7 +334,7 @@ def _times(
     if len(pose_times_ns) != lines:
         has = f"the file of poses, one a line, has the times of {len(pose_times_ns)}"
         raise UserError(f"{path}: {lines} lines, but {has}")
-    return pose_times_ns, False
+    return pose_times_ns
 
 
 def _of_file(times: Path, image: Path, lines: int, day: date | None, notes: list[str]) -> NDArray[np.int64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import date
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -116,7 +117,8 @@ def headwall_line_times(path: Path, notes: list[str]) -> NDArray[np.int64]:
         raise UserError(f"{path}: counts of a clock, wanted imu_gps.txt beside it, which has their UTC")
     counts = numbers_of(path, rows[1:], {"Timestamp": 1})[:, 0]
     _refuse_late(path, [number for number, _ in rows[1:]], np.diff(counts) <= 0)
-    clock, utc_ns = headwall_clock(log)
+    stat = log.stat()
+    clock, utc_ns = _clock(log, stat.st_mtime_ns, stat.st_size)
     if counts[0] < clock[0] or counts[-1] > clock[-1]:
         span = f"wanted the range of {log.name}, {clock[0]:.0f} to {clock[-1]:.0f}"
         raise UserError(f"{path}: Timestamp: {counts[0]:.0f} to {counts[-1]:.0f}, {span}")
@@ -131,6 +133,12 @@ def headwall_line_times(path: Path, notes: list[str]) -> NDArray[np.int64]:
     known = f"{path.name}: Timestamp has its UTC from {log.name}"
     notes.append(f"{known}, readings scatter by {scatter_s * 1e3:.1f} ms" if scatter_s > _SCATTER_S else known)
     return utc_ns[0] + np.rint(line(counts) * 1e9).astype(np.int64)
+
+
+@lru_cache(maxsize=1)
+def _clock(log: Path, _time_ns: int, _bytes: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The clock of a log as it is, read once for all cubes of a flight."""
+    return headwall_clock(log)
 
 
 def _refuse_late(path: Path, numbers: list[int], late: NDArray[np.bool_]) -> None:
