@@ -174,6 +174,11 @@ def _look(model: Element, samples: int, notes: list[str]) -> PolynomialLook:
     calibration = model.need(
         "Geometric_Calibration/Instrument_Calibration", "look angles of the detectors", "Sensor_Viewing_Model"
     )
+    biases = calibration.find("Instrument_Biases")
+    turns = [] if biases is None else [biases.number(name, default=0.0) for name in ("YAW", "PITCH", "ROLL")]
+    if any(turns):
+        told = ", ".join(f"{turn:g}" for turn in turns)
+        notes.append(f"{model.path.name}: Instrument_Biases: yaw, pitch, roll of {told} are not applied")
     swath = calibration.find("Swath_Range", "Position_In_Retina", ".//Swath_Range")
     bands = calibration.node.findall(".//Polynomial_Look_Angles")
     if len(bands) > 1:

@@ -67,6 +67,19 @@ def test_orbit_and_attitudes_of_dimap_2_that_end_inside_the_scene(tmp_path):
         read_scene(write_dimap2(tmp_path / "short.xml", truth, short_s=0.06))
 
 
+def test_biases_of_the_instrument_of_dimap_2_are_told(tmp_path):
+    """All real files have zeros there; nobody knows what else would mean."""
+    path = write_dimap2(tmp_path / "scene.xml", Truth())
+    text, place = path.read_text(), "<Geometric_Calibration><Instrument_Calibration>"
+    for pitch, said in (
+        ("0.0", []),
+        ("1e-3", ["scene.xml: Instrument_Biases: yaw, pitch, roll of 0, 0.001, 0 are not applied"]),
+    ):
+        biases = f"<Instrument_Biases><YAW>0.0</YAW><PITCH>{pitch}</PITCH><ROLL>0.0</ROLL></Instrument_Biases>"
+        path.write_text(text.replace(place, place + biases))
+        assert read_scene(path).notes == said
+
+
 @pytest.mark.parametrize("unit", [None, "ms", "microsecond", "us", "s"])
 def test_units_of_the_line_period_of_dimap_2(unit, tmp_path):
     """Milliseconds of Pleiades, microseconds of SPOT-6/7; some files do not tell."""
