@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from ....solver.location.look_directions import PolynomialLook
 from ....solver.location.pushbroom import PushbroomSensor
-from ....solver.location.rpc import Rpc
 from ....solver.orbit.attitude import Attitude, PolynomialAttitude, SplineAttitude
 from ....solver.orbit.line_times import UniformLineTimes
 from ....solver.orbit.motion import Motion
@@ -53,16 +52,24 @@ def read_dimap2(root: Element) -> SatelliteScene:
     UserError : an element that is missing or has no sense, by its place in the document
     """
     notes: list[str] = []
+    model = root.find("Geometric_Data/Refined_Model", "Geometric_Data/Sensor_Model_Characteristics")
+    named = root.find(_RPC_FILE)
+    if model is None and named is None:
+        raise root.refuse(
+            "Geometric_Data/Refined_Model",
+            "the rigorous model of a SENSOR product (DIM_*.XML; an ORTHO product has none)",
+        )
     size = root.need("Raster_Dimensions", "the size of the image", "Raster_Data/Raster_Dimensions")
     lines, samples = size.integer("NROWS", low=1), size.integer("NCOLS", low=1)
-    rpc = _rpc(root, lines, samples)
-    model = root.find("Geometric_Data/Refined_Model", "Geometric_Data/Sensor_Model_Characteristics")
+    rpc = read_dimap_rpc(root, lines, samples) if has_dimap_rpc(root) else None
+    if rpc is None and named is not None:
+        path = root.path.parent / named.node.get("href", "")
+        if path.is_file():
+            rpc = read_dimap_rpc(read_xml(path), lines, samples)
+        elif model is None:
+            raise named.refuse("", "this file beside it, as there is no rigorous model", path.name)
     if model is None:
-        if rpc is not None:
-            return SatelliteScene("rpc", None, rpc)
-        raise root.refuse(
-            "Geometric_Data/Refined_Model", "the rigorous model of a SENSOR product (an ORTHO product has none)"
-        )
+        return SatelliteScene("rpc", None, rpc)
     start, period_s = _times(model, lines)
     last_ns = start + round((lines - 1) * period_s * 1e9)
     try:
@@ -79,15 +86,6 @@ def read_dimap2(root: Element) -> SatelliteScene:
         raise UserError(f"{root.path}: {model.where}: {error}") from None
     notes += corner_notes(sensor, root.find("Dataset_Content/Dataset_Extent", "Product_Frame/Dataset_Frame"))
     return SatelliteScene("dimap2", sensor, rpc, notes)
-
-
-def _rpc(root: Element, lines: int, samples: int) -> Rpc | None:
-    """The polynomials in a document, or in the file that it names."""
-    if has_dimap_rpc(root):
-        return read_dimap_rpc(root, lines, samples)
-    named = root.find(_RPC_FILE)
-    path = None if named is None else root.path.parent / named.node.get("href", "")
-    return read_dimap_rpc(read_xml(path), lines, samples) if path is not None and path.is_file() else None
 
 
 def _times(model: Element, lines: int) -> tuple[int, float]:

@@ -55,6 +55,11 @@ def gap(text, tag, low, high):
         (lambda s: without(s, "Quaternion_List"), "Quaternion_List: missing, wanted polynomials or a list"),
         (lambda s: without(s, "Refined_Model"), "Refined_Model: missing, wanted the rigorous model of a SENSOR"),
         (lambda s: without(s, "Raster_Data"), "Raster_Dimensions: missing, wanted the size of the image"),
+        # the list of the files of a product, VOL_*.XML
+        (
+            lambda s: without(without(s, "Raster_Data"), "Geometric_Data"),
+            r"Refined_Model: missing, .*\(DIM_\*.XML; an OR",
+        ),
         (lambda s: without(s, "XLOS_0"), "XLOS_0: missing, wanted a number"),
         (
             lambda s: gap(s, "Quaternion", 9, 16),

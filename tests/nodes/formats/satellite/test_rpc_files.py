@@ -154,6 +154,9 @@ def test_polynomials_that_a_scene_of_dimap_2_names(rpc, tmp_path):
     text = scene.read_text().replace("<Geometric_Data>", f"<Geoposition>{model}</Geoposition><Geometric_Data>")
     scene.write_text(text)
     assert read_scene(scene).rpc is None  # the file is not there
+    scene.write_text(text.replace("Geometric_Data", "Other_Data"))
+    with pytest.raises(UserError, match=r"COMPONENT_PATH: 'RPC_a\.XML', wanted this file beside it"):
+        read_scene(scene)
     write_dimap(tmp_path / "RPC_a.XML", rpc)
     for name, kind in (("Geometric_Data", "dimap2"), ("Other_Data", "rpc")):  # with a rigorous model, and without
         scene.write_text(text.replace("Geometric_Data", name))
