@@ -11,7 +11,7 @@ from .csm_isd import read_isd
 from .dimap1 import read_dimap1
 from .dimap2 import read_dimap2
 from .folder import is_scene_folder, read_scene_folder
-from .rpc_files import has_dimap_rpc, read_dimap_rpc, read_rpb, read_rpc_tags, read_rpc_text
+from .rpc_files import has_dimap_rpc, read_dimap_rpc, read_maxar_rpc, read_rpb, read_rpc_tags, read_rpc_text
 from .scene import SatelliteScene
 from .xml_file import Element, read_xml, text_start
 
@@ -21,8 +21,10 @@ KINDS = {
     "dimap1": "DIMAP 1 (SPOT-1 to SPOT-5)",
     "isd": "community sensor model ISD (JSON)",
     "folder": "folder of a scene (ephemeris.csv, attitude.csv, line_times.csv, camera.json)",
-    "rpc": "RPC (DIMAP, .RPB, _RPC.TXT, .geom, tags of an image)",
+    "rpc": "RPC (DIMAP, .RPB, XML of WorldView, _RPC.TXT, .geom, tags of an image)",
 }
+#: What is read as XML.
+XML_KINDS = (KINDS["dimap2"], KINDS["dimap1"], "RPC of DIMAP", "XML of WorldView (isd)")
 #: Ends of names of images, whose tags may have polynomials.
 IMAGES = (".tif", ".tiff", ".jp2", ".ntf", ".nitf", ".img", ".vrt")
 
@@ -63,8 +65,10 @@ def read_scene(path: Path) -> SatelliteScene:
 
 
 def _read_xml_scene(root: Element) -> SatelliteScene:
+    if root.tag.lower() == "isd":
+        return SatelliteScene("rpc", None, read_maxar_rpc(root))
     if "dimap" not in root.tag.lower():
-        raise UserError(f"{root.path}: XML with the root {root.tag}, wanted {KINDS['dimap2']} or {KINDS['dimap1']}")
+        raise UserError(f"{root.path}: XML with the root {root.tag}, wanted one of: {'; '.join(XML_KINDS)}")
     if root.find("Metadata_Id/METADATA_FORMAT") is not None:
         return read_dimap1(root)
     rigorous = root.find("Geometric_Data/Refined_Model", "Geometric_Data/Sensor_Model_Characteristics") is not None

@@ -1,9 +1,10 @@
-"""Rational polynomials in files: tags of a GeoTIFF, .RPB, _RPC.TXT, DIMAP and OSSIM .geom.
+"""Rational polynomials in files: tags of a GeoTIFF, .RPB and XML of Maxar, _RPC.TXT, DIMAP and OSSIM .geom.
 
-Pixels. RPC00B files (GeoTIFF, RPB, _RPC.TXT, geom) count lines and samples from 0 at the centre of the first pixel, as
-triline does (rasterio's ``rowcol`` counts from the corner and is half a pixel more). DIMAP 2 counts rows and columns
-from 1, DIMAP 3 (Pleiades Neo) from 0. Where the polynomials hold may be wider than the image, whose size the file of
-the scene beside them tells; without that file it is the size of the image where it begins with the first pixel.
+Pixels. RPC00B files (GeoTIFF, RPB, XML of Maxar, _RPC.TXT, geom) count lines and samples from 0 at the centre of the
+first pixel, as triline does (rasterio's ``rowcol`` counts from the corner and is half a pixel more). DIMAP 2 counts
+rows and columns from 1, DIMAP 3 (Pleiades Neo) from 0. Where the polynomials hold may be wider than the image, whose
+size the file of the scene beside them tells; without that file it is the size of the image where it begins with the
+first pixel.
 """
 
 from __future__ import annotations
@@ -125,6 +126,32 @@ def read_rpb(path: Path) -> Rpc:
             raise UserError(f"{path}: {key}: {len(numbers)}, wanted 20 numbers")
         lists[name] = np.array(numbers)
     return _rpc(path, values, lists, 0, 0)
+
+
+def read_maxar_rpc(root: Element) -> Rpc:
+    """The XML of a WorldView scene (root ``isd``), which has what an ``.RPB`` has under other names.
+
+    Raises
+    ------
+    UserError : an element that is missing or has no sense
+    """
+    rpb = root.need("RPB", "rational polynomials")
+    if rpb.find("SPECID") is not None and rpb.text("SPECID").upper() != "RPC00B":
+        raise rpb.refuse("SPECID", "RPC00B (the order of terms)", rpb.text("SPECID"))
+    image = rpb.need("IMAGE", "offsets, scales and coefficients")
+    values = {
+        f"{name}_{short}": image.number(f"{name}{word}")
+        for name in _NAMES
+        for short, word in (("OFF", "OFFSET"), ("SCALE", "SCALE"))
+    }
+    values |= {key: image.number(key.replace("_", ""), default=0.0) for key in ("ERR_BIAS", "ERR_RAND")}
+    lists = {}
+    for name in ("SAMP_NUM_COEFF", "SAMP_DEN_COEFF", "LINE_NUM_COEFF", "LINE_DEN_COEFF"):
+        tag = name.removesuffix("F").replace("_", "")
+        lists[name] = image.numbers(f"{tag}List/{tag}", 20)
+    size = root.find("IMD")
+    lines, samples = (0, 0) if size is None else (size.integer("NUMROWS", low=1), size.integer("NUMCOLUMNS", low=1))
+    return _rpc(root.path, values, lists, lines, samples)
 
 
 def _value(path: Path, found: dict[str, str], key: str) -> float:

@@ -105,13 +105,30 @@ def _text(path, rpc):
     return path
 
 
+def write_maxar(path, rpc):
+    f = rpc.to_image
+    names = ("LONG", "LAT", "HEIGHT", "SAMP", "LINE")
+    rows = [f"<{n}OFFSET>{x:.17g}</{n}OFFSET>" for n, x in zip(names, (*f.in_offset, *f.out_offset), strict=True)]
+    rows += [f"<{n}SCALE>{x:.17g}</{n}SCALE>" for n, x in zip(names, (*f.in_scale, *f.out_scale), strict=True)]
+    for k, name in enumerate(("SAMPNUM", "SAMPDEN", "LINENUM", "LINEDEN")):
+        numbers = " ".join(f"{c:.17E}" for c in f.coefficients[k])
+        rows.append(f"<{name}COEFList><{name}COEF>{numbers} </{name}COEF></{name}COEFList>")
+    size = "<IMD><NUMROWS>20000</NUMROWS><NUMCOLUMNS>6000</NUMCOLUMNS></IMD>"
+    errors = "<ERRBIAS>3.29</ERRBIAS><ERRRAND>2.6e-1</ERRRAND>"
+    path.write_text(
+        f"<isd>{size}<RPB><SATID>WV01</SATID><SPECID>RPC00B</SPECID><IMAGE>{errors}{''.join(rows)}</IMAGE></RPB></isd>"
+    )
+    return path
+
+
 def _dimap3_with_margins(path, rpc):
     return write_dimap3(path, rpc, (4900, 4510))
 
 
 WRITERS = {
     "a.tif": write_geotiff, "a.RPB": _rpb, "a_RPC.TXT": _text, "a.geom": write_geom, "RPC_a.XML": write_dimap,
-    "RPC_PNEO.XML": write_dimap3, "RPC_PNEO4.XML": _dimap3_with_margins, "a.vrt": write_copy, "a.pix": write_copy,
+    "RPC_PNEO.XML": write_dimap3, "RPC_PNEO4.XML": _dimap3_with_margins,
+    "a.XML": write_maxar, "a.vrt": write_copy, "a.pix": write_copy,
 }  # fmt: skip
 
 
@@ -127,6 +144,11 @@ def test_the_same_polynomials_come_back(name, rpc, tmp_path):
 def test_size_of_an_image_of_dimap_3(rpc, tmp_path):
     back = read_scene(write_dimap3(tmp_path / "RPC_PNEO.XML", rpc)).model()
     assert (back.lines, back.samples) == (20_000, 6_000) and back.to_ground is not None
+
+
+def test_size_and_errors_of_the_xml_of_maxar(rpc, tmp_path):
+    back = read_scene(write_maxar(tmp_path / "a.XML", rpc)).model()
+    assert (back.lines, back.samples, back.error_bias_m, back.error_random_m) == (20_000, 6_000, 3.29, 0.26)
 
 
 def test_polynomials_of_dimap_that_hold_beyond_the_image_do_not_tell_its_size(rpc, tmp_path):
@@ -216,6 +238,8 @@ def test_geom_of_ossim(name):
         ("a_RPC.TXT", lambda s: s.replace("SAMP_SCALE: ", "SAMP_SCALE: x"), "samp_scale: 'x.*wanted a number"),
         ("a_RPC.TXT", lambda s: s.replace("LINE_DEN_COEFF_7:", "LINE_DEN_COEFF_77:"), "line_den_coeff_07: missing"),
         ("a.RPB", lambda s: s.replace("RPC00B", "RPC00A"), 'SpecId: "RPC00A", wanted RPC00B'),
+        ("a.XML", lambda s: s.replace("RPC00B", "RPC00A"), "isd/RPB/SPECID: 'RPC00A', wanted RPC00B"),
+        ("a.XML", lambda s: s.replace("RPB>", "RPX>"), "isd/RPB: missing, wanted rational polynomials"),
         ("a.geom", lambda s: s.replace("polynomial_format:  B", "polynomial_format:  A"), "'A', wanted B"),
         ("RPC_a.XML", lambda s: s.replace("LINE_NUM_COEFF_3>", "X>"), "LINE_NUM_COEFF_3: missing, wanted a number"),
         ("RPC_a.XML", lambda s: s.replace("<LAT_SCALE>", "<LAT_SCALE>0 "), "LAT_SCALE.*wanted a number"),
