@@ -133,6 +133,8 @@ def kind_of_path(path: Path) -> str:
             return "flight"
         if is_scene_block(path):
             return "scenes"
+        if other := other_kind(path):
+            raise UserError(f"{path}: {other}")
         if is_block_folder(path):
             return "block"
         if any((path / name).is_file() for name in ("imu.csv", "gnss.csv", "gnss.pos", "attitude.csv")):

@@ -22,6 +22,8 @@ PARTS = {
     "ground_points.csv": "known points of a block folder",
     "image_points.csv": "image points of a block folder",
 }
+#: Files that a folder of a satellite scene has.
+_SCENE_FOLDER = ("ephemeris.csv", "line_times.csv")
 #: How compressed files begin -> their name.
 _PACKED = {
     b"\x1f\x8b": "gzip",
@@ -33,7 +35,9 @@ _PACKED = {
 
 
 def other_kind(path: Path) -> str | None:
-    """What a file seems to be, and which command wants it, in words that follow its name; None where nobody knows."""
+    """What a file or folder seems to be, and which command wants it, in words that follow its name; else None."""
+    if all((path / name).is_file() for name in _SCENE_FOLDER):
+        return _scene("folder of a satellite scene")
     if not path.is_file():
         return None
     with open(path, "rb") as file:
@@ -48,7 +52,7 @@ def other_kind(path: Path) -> str | None:
         return _of_json(head)
     if suffix in (".rpb", ".geom") or name.upper().endswith("_RPC.TXT") or b"LINE_OFF" in head.upper():
         return _scene("rational polynomials of a satellite scene")
-    if b"dimap_document" in head[:512].lower():
+    if b"dimap_document" in head[:512].lower() or b"<isd>" in head[:512].lower():
         return _scene("metadata of a satellite scene")
     if suffix == ".times" or is_frame_index(path):
         return "times of image lines, which `triline import` finds beside their image, or takes by --line-times"

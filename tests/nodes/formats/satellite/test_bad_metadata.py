@@ -254,8 +254,11 @@ def test_damaged_files_are_read_or_refused_in_one_line(name, tmp_path):
 
 
 def test_import_names_locate(tmp_path):
-    with pytest.raises(UserError, match=r"metadata of a satellite scene, which `triline locate` and"):
-        kind_of_path(write_dimap2(tmp_path / "scene.xml", TRUTH))
+    world_view = tmp_path / "WV01.XML"
+    world_view.write_text('<?xml version="1.0"?>\n<isd>\n<IMD></IMD></isd>\n')
+    for path in (write_dimap2(tmp_path / "scene.xml", TRUTH), world_view, write_folder(tmp_path / "scene", TRUTH)):
+        with pytest.raises(UserError, match=r"(metadata|folder) of a satellite scene, which `triline locate` and"):
+            kind_of_path(path)
 
 
 def test_years_that_no_satellite_saw(tmp_path):
