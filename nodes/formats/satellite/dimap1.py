@@ -1,14 +1,14 @@
 """DIMAP 1: scenes of SPOT-1 to SPOT-5 (HRV, HRVIR, HRG, HRS) of level 1A.
 
-Conventions (SPOT Satellite Geometry Handbook). Rows and columns count from 1 at the centre of the first pixel; a row
-is taken at the time of the centre of the scene plus its distance in line periods. Positions and velocities are
+Conventions (SPOT Satellite Geometry Handbook). Rows and columns count from 1 at the centre of the first pixel; a
+row is taken at the time of the centre of the scene plus its distance in line periods. Positions and velocities are
 Earth-fixed, interpolated by Lagrange's formula through eight nodes. The orbital frame has Z away from the Earth's
-centre, X along ``v x Z``, Y = Z x X. The velocity is that over the rotating Earth for SPOT-5, which is steered in yaw,
-and that against the stars for SPOT-1 to 4, which are not (the corners in their files are met to 4 m; by the other
-velocity they are missed by 1 to 24 km). Roll turns about Y, pitch about X, yaw about Z; roll and pitch count
-negative; pitch is applied last. Angles are linear between their nodes. SPOT-1 to 4 have angles at both ends, and
-angular speeds between, which are summed up to nodes. A detector looks along ``(-tan psi_y, tan psi_x, -1)``. Light
-time and aberration are not applied.
+centre, X along ``v x Z``, Y = Z x X. The velocity is that over the rotating Earth for SPOT-5, which is steered in
+yaw, and that against the stars for SPOT-1 to 4, which are not (the corners in their files, which leave the
+attitudes out, are met to 4 m; by the other velocity they are missed by 1 to 24 km). Roll turns about Y, pitch
+about X, yaw about Z; roll and pitch count negative; pitch is applied last. Angles are linear between their nodes.
+SPOT-1 to 4 have angles at both ends, and angular speeds between, which are summed up to nodes. A detector looks
+along ``(-tan psi_y, tan psi_x, -1)``. Light time and aberration are not applied.
 """
 
 from __future__ import annotations
