@@ -20,6 +20,12 @@ def write_recording(path: Path, messages: Iterable[Message], **options) -> Path:
     return path
 
 
+def without_topics(path: Path, out: Path, *topics: str) -> Path:
+    """Write a recording again, without topics that begin so; return the path of what is left."""
+    messages = RecordingReader(path).sorted_messages()
+    return write_recording(out, (message for message in messages if not message.topic.startswith(topics)))
+
+
 def payloads(path: Path, topic: str) -> list[tuple[int, int, bytes]]:
     """Stamp, number and payload of the messages of a topic, in order."""
     reader = RecordingReader(path)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recording_file import write_recording
 
 from triline.nodes import registry
 from triline.nodes.cli import main
@@ -32,9 +33,7 @@ def flight(tmp_path_factory):
     plan = FlightPlan(strip_s=12.0, lead_in_s=3.0, lead_out_s=2.0)
     errors = ErrorModel(attitude_rate_hz=50.0, offset_sigma_m=(0.3, 0.3, 2.0))
     simulation = simulate(plan, 4, errors, ObservationPlan(tie_points_per_s=5.0, control=0, check=0))
-    with RecordingWriter(folder / "flight.mcap") as writer:
-        for message in Simulator(simulation).messages(EPOCH):
-            writer.write(message)
+    write_recording(folder / "flight.mcap", Simulator(simulation).messages(EPOCH))
     write_heights(folder / "dem.tif", raster(simulation))
     (folder / "flight.toml").write_text(
         '[flight]\nname = "f"\n[dem]\nfile = "dem.tif"\nsigma_m = 0.3\nshift_sigma_m = 0.2\n'

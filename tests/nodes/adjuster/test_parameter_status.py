@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from notebook import Notebook
+from recording_file import write_recording
 from rich.console import Console
 
 from triline.nodes.adjuster.adjuster import Adjuster
 from triline.nodes.cli.view import show
 from triline.nodes.monitor.monitor import Monitor, screen
 from triline.nodes.navigator.navigator import Navigator
-from triline.nodes.recording.writer import RecordingWriter
 from triline.nodes.report.analysis import analyse
 from triline.nodes.report.page import page
 from triline.nodes.report.source import read
@@ -126,9 +126,7 @@ def test_the_monitor_says_how_many_and_which_not(flown):
 
 def test_the_report_has_status_time_and_correlation(flown, tmp_path):
     messages, kept = flown
-    with RecordingWriter(tmp_path / "flight.mcap") as writer:
-        for message in sorted(messages, key=lambda x: x.stamp_ns):
-            writer.write(message)
+    write_recording(tmp_path / "flight.mcap", sorted(messages, key=lambda x: x.stamp_ns))
     flight, held = read(tmp_path / "flight.mcap")
     result = analyse(flight, held)
     rows = {p["name"]: p for p in result["parameters"]}

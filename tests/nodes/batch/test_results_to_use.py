@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import rasterio
+from recording_file import write_recording
 from test_adjust_command import AXES, write_block
 
 from triline.nodes.batch.rectification import OfTable, project_frame
@@ -237,10 +238,8 @@ def test_lines_have_the_last_whole_orientation(oriented, tmp_path):
 def test_lines_of_a_strip_without_whole_orientation_have_the_sigmas_of_the_final_one(oriented, tmp_path):
     path, _ = oriented
     cut, out = tmp_path / "cut.mcap", tmp_path / "lines.csv"
-    with RecordingWriter(cut) as writer:
-        for message in Recording(path).messages():
-            if message.topic != "orientation/whole" or message.body.strip != "S2":
-                writer.write(message)
+    messages = Recording(path).messages()
+    write_recording(cut, (x for x in messages if x.topic != "orientation/whole" or x.body.strip != "S2"))
     assert main(["export", str(cut), "--per-line", str(out), "-q"]) == 0
     lines, final = pd.read_csv(out), Recording(path).poses("orientation/final")
     own, known = lines[lines.strip == "S2"], final.strip == "S2"

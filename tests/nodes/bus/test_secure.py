@@ -20,13 +20,13 @@ from types import SimpleNamespace
 import pytest
 import sample_messages as sample
 from bus_rig import Rig, free_port, triline, wait_for
+from command_line import run
 from cryptography import x509
 
 from triline.nodes.bus.authority import AIRCRAFT, CERTIFICATE, DESK, KEY, USES, Authority
 from triline.nodes.bus.bundle import ExpiryWatch, load_bundle
 from triline.nodes.bus.program import ProgramOptions
 from triline.nodes.bus.session import Bus
-from triline.nodes.cli import main
 from triline.nodes.cli.live_flight import LiveFlight
 from triline.nodes.errors import UserError
 from triline.nodes.node import Message
@@ -41,8 +41,7 @@ def authority(tmp_path) -> Authority:
 
 
 def keys(capsys, *arguments) -> tuple[int, str, str]:
-    code = main(["keys", *map(str, arguments)])
-    return (code, *capsys.readouterr())
+    return run(capsys, "keys", *arguments)
 
 
 def test_keys_makes_bundles_lists_and_revokes(tmp_path, capsys):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 
 import pytest
+from command_line import refusal
+from recording_file import without_topics
 
 from triline.nodes.cli import main
-from triline.nodes.recording.reader import RecordingReader
-from triline.nodes.recording.writer import RecordingWriter
 
 
 @pytest.fixture(scope="module")
@@ -16,14 +16,6 @@ def flight(tmp_path_factory):
     path = tmp_path_factory.mktemp("flight") / "flight.mcap"
     assert main(["simulate", "-o", str(path), "--seconds", "12", "--seed", "4", "-q"]) == 0
     return path
-
-
-def without(path, out, *topics):
-    with RecordingWriter(out) as writer:
-        for message in RecordingReader(path).sorted_messages():
-            if message.topic not in topics:
-                writer.write(message)
-    return out
 
 
 def test_the_answer_is_that_of_the_processed_recording(flight, tmp_path, capsys):
@@ -50,6 +42,4 @@ def test_the_answer_is_that_of_the_processed_recording(flight, tmp_path, capsys)
     ],
 )
 def test_what_is_missing_is_told(flight, tmp_path, capsys, lost, told):
-    assert main(["adjust", str(without(flight, tmp_path / "lost.mcap", lost))]) == 1
-    error = capsys.readouterr().err
-    assert told in error and error.count("\n") == 1, error
+    assert told in refusal(capsys, "adjust", without_topics(flight, tmp_path / "lost.mcap", lost))

@@ -6,7 +6,6 @@ import argparse
 import json
 import os
 import shutil
-import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 from block_writer import write_block
 from bus_rig import free_port, simulated_flight
+from command_line import run
 from recording_file import chunk_spans
 from small_block import simulated_block
 
@@ -24,21 +24,6 @@ from triline.nodes.recording.writer import RecordingWriter
 from triline.solver.geometry.frames import CrsError
 
 # ---- weak networks and what the files say of them, as a user meets them
-
-
-def run_main(capsys, *arguments) -> tuple[int, str, str]:
-    """Exit code, standard output, standard error of a command."""
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        code = main([str(a) for a in arguments])
-    except SystemExit as exit_:
-        code = int(exit_.code or 0)
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-    out, err = capsys.readouterr()
-    assert "Traceback" not in err and "fault in triline" not in err, err
-    return code, out, err
 
 
 def _keep_rows(path: Path, keep: Callable[[list[str]], bool]) -> None:
@@ -64,7 +49,7 @@ def test_weak_blocks_get_a_result_that_names_what_is_open_or_one_line(tmp_path, 
     _keep_rows(tmp_path / "image_points.csv", lambda row: row[0] in chosen)
     if not control:
         _keep_rows(tmp_path / "ground_points.csv", lambda row: row[-1] == "check")
-    code, out, err = run_main(capsys, "adjust", tmp_path, "--json", *options)
+    code, out, err = run(capsys, "adjust", tmp_path, "--json", *options)
     if code == 1:
         assert out == "" and len(err.splitlines()) == 1 and err.startswith("triline adjust: "), (name, err)
         assert points == 0
@@ -81,9 +66,9 @@ def test_weak_blocks_get_a_result_that_names_what_is_open_or_one_line(tmp_path, 
 @pytest.mark.parametrize("options", [("--control", 0, "--check", 0), ("--ties", 0), ("--ties", 0, "--control", 0)])
 def test_a_flight_without_control_or_ties_is_flown_to_the_end(tmp_path, capsys, options):
     flight, out_path = tmp_path / "flight.mcap", tmp_path / "out.mcap"
-    code, _, err = run_main(capsys, "simulate", "-o", flight, "--seconds", 4, "--lead-in", 3, "-q", *options)
+    code, _, err = run(capsys, "simulate", "-o", flight, "--seconds", 4, "--lead-in", 3, "-q", *options)
     assert (code, err) == (0, "")
-    code, out, err = run_main(capsys, "process", flight, "-o", out_path, "--json")
+    code, out, err = run(capsys, "process", flight, "-o", out_path, "--json")
     assert (code, err) == (0, "")
     result = json.loads(out)
     assert result["outputs"]["orientation/final"] > 70 and "failed" not in result["counters"]["adjuster"]
@@ -105,7 +90,7 @@ def test_a_recording_whose_head_is_lost_is_refused_with_the_reason(tmp_path, cap
     flipped, cut, out = tmp_path / "flipped.mcap", tmp_path / "cut.mcap", tmp_path / "out.mcap"
     flipped.write_bytes(data)
     cut.write_bytes(data[: first[1] - 10])
-    code, text, err = run_main(capsys, "process", flipped, "-o", out)
+    code, text, err = run(capsys, "process", flipped, "-o", out)
     assert code == 1 and text == "" and "nothing came out: navigator waiting for configuration/project" in err
     damage = "(the file ends inside a record at byte"
     for *command, lacks in (
@@ -117,12 +102,12 @@ def test_a_recording_whose_head_is_lost_is_refused_with_the_reason(tmp_path, cap
         ("export", "--points", out, cut, "no message on point/object: `triline process` makes them"),
         ("export", "--topic", "sensor/gnss", "--csv", out, cut, "no message on sensor/gnss; it holds no message"),
     ):
-        code, text, err = run_main(capsys, *command)
+        code, text, err = run(capsys, *command)
         assert code == 1 and text == "" and f"{lacks} {damage}" in err, err
         assert len(err.splitlines()) == 1 and not out.exists() and not list(tmp_path.glob("*.part"))
-    code, text, err = run_main(capsys, "info", cut)
+    code, text, err = run(capsys, "info", cut)
     assert code == 0 and "0 messages" in text and "not as it should be: the file ends inside a record" in text
-    code, text, err = run_main(capsys, "recover", cut, "-o", out)
+    code, text, err = run(capsys, "recover", cut, "-o", out)
     assert code == 1 and "nothing in it that could be recovered" in err and not out.exists()
 
 
@@ -132,18 +117,18 @@ def test_process_tells_what_it_skipped(tmp_path, capsys):
     data[sum(last) // 2] ^= 1
     path, out = tmp_path / "flipped.mcap", tmp_path / "out.mcap"
     path.write_bytes(data)
-    code, text, err = run_main(capsys, "process", path, "-o", out, "--json")
+    code, text, err = run(capsys, "process", path, "-o", out, "--json")
     result = json.loads(text)
     assert code == 0 and err == "" and result["lost_bytes"] == last[1] - last[0]
     assert len(result["damage"]) == 1 and "a chunk with a wrong checksum" in result["damage"][0]
-    code, _, err = run_main(capsys, "process", path, "-o", out, "-q")
+    code, _, err = run(capsys, "process", path, "-o", out, "-q")
     assert code == 0 and "skipped 1 damaged place: a chunk" in err and len(err.splitlines()) == 1
 
 
 def test_commands_that_work_on_what_is_left_say_that_something_is_missing(tmp_path, capsys):
     whole, cut = tmp_path / "whole.mcap", tmp_path / "cut.mcap"
     flight = ("--seconds", 8, "--lead-in", 30, "--images", "--pixels", 100, "--imu", "tactical", "-q")
-    assert run_main(capsys, "simulate", "-o", whole, *flight)[0] == 0
+    assert run(capsys, "simulate", "-o", whole, *flight)[0] == 0
     data = whole.read_bytes()
     cut.write_bytes(data[: int(0.8 * len(data))])
     for command in (
@@ -151,7 +136,7 @@ def test_commands_that_work_on_what_is_left_say_that_something_is_missing(tmp_pa
         ("rectify", cut, "-o", tmp_path / "o.tif", "--orientation", "truth", "-q"),
         ("view", cut, "--rrd", tmp_path / "v.rrd"),
     ):
-        code, out, err = run_main(capsys, *command)
+        code, out, err = run(capsys, *command)
         assert code == 0 and "the file ends" in out + err, command
 
 
@@ -176,7 +161,7 @@ def test_no_command_takes_its_input_for_its_output_or_a_device_for_a_file(tmp_pa
         ("simulate", "-o", tmp_path, "--seconds", 2),
         ("node", "recorder", "-o", tmp_path),
     ):
-        code, out, err = run_main(capsys, *arguments)
+        code, out, err = run(capsys, *arguments)
         assert code == 1 and out == "" and len(err.splitlines()) == 1, (arguments, err)
         assert path.read_bytes() == before and not Path(os.devnull).is_file()
     assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
@@ -201,7 +186,7 @@ def test_no_command_writes_over_another_of_its_inputs(tmp_path, capsys):
         ("view", other, "--rrd", other),
         ("view", path, other, "--fleet", "--rrd", other),
     ):
-        code, _, err = run_main(capsys, *arguments)
+        code, _, err = run(capsys, *arguments)
         assert code == 1 and "the output would overwrite the" in err, (arguments, err)
         assert other.read_text() == "mine"
     block = tmp_path / "block"
@@ -224,13 +209,13 @@ def test_no_command_writes_over_another_of_its_inputs(tmp_path, capsys):
         (("rectify", other, "--sensor", path, "-o", "x.tif", "--mask", path), "the output would overwrite the sensor"),
         (("import", block, "-o", trajectory), f"the output would overwrite a file of {block}"),
     ):
-        code, _, err = run_main(capsys, *arguments)
+        code, _, err = run(capsys, *arguments)
         assert code == 1 and said in err and len(err.splitlines()) == 1, (arguments, err)
     assert times.read_text() == "mine" and trajectory.read_bytes() == flown
     (block / "mes.csv").write_text("a result")  # the end of a name that stands there
     refuse_input_as_output(argparse.Namespace(block=block, csv=block / "mes.csv"))
     shutil.rmtree(block)
-    code, _, err = run_main(capsys, "simulate", "--seconds", 2, "-o", tmp_path / "new", "--dem", tmp_path / "new")
+    code, _, err = run(capsys, "simulate", "--seconds", 2, "-o", tmp_path / "new", "--dem", tmp_path / "new")
     assert code == 1 and "wanted different files" in err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "other"]
 
@@ -249,7 +234,7 @@ def test_no_command_writes_over_another_of_its_inputs(tmp_path, capsys):
 def test_an_output_without_a_name_is_refused(arguments, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     option = "" if arguments[0] == "new" else next(w for w in reversed(arguments) if w).rstrip("=") + " "
-    assert run_main(capsys, *arguments) == (1, "", f"triline {arguments[0]}: {option}'': wanted a name\n")
+    assert run(capsys, *arguments) == (1, "", f"triline {arguments[0]}: {option}'': wanted a name\n")
     assert not list(tmp_path.iterdir())
 
 
@@ -266,29 +251,29 @@ def test_an_output_without_a_name_is_refused(arguments, tmp_path, capsys, monkey
 def test_standard_output_is_no_file(arguments, said, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     told = f"triline {arguments[0]}: {said}: wanted the name of a file, not standard input or output\n"
-    assert run_main(capsys, *arguments) == (1, "", told)
+    assert run(capsys, *arguments) == (1, "", told)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_result_is_not_written_among_the_files_of_a_block(tmp_path, capsys):
     write_block(tmp_path / "block", simulated_block())
     before = sorted(p.name for p in (tmp_path / "block").iterdir())
-    code, _, err = run_main(capsys, "adjust", tmp_path / "block", "-o", tmp_path / "block")
+    code, _, err = run(capsys, "adjust", tmp_path / "block", "-o", tmp_path / "block")
     assert code == 1 and "has the files of a block or a flight, wanted another folder for the result" in err
     assert sorted(p.name for p in (tmp_path / "block").iterdir()) == before
     # what lies in a folder that no adjustment made stays there
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "orientation_lines.csv").write_text("mine")
-    assert run_main(capsys, "adjust", tmp_path / "block", "-o", tmp_path / "mine")[0] == 0
+    assert run(capsys, "adjust", tmp_path / "block", "-o", tmp_path / "mine")[0] == 0
     assert (tmp_path / "mine" / "orientation_lines.csv").read_text() == "mine"
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_an_example_and_the_common_options(command, capsys):
-    code, out, err = run_main(capsys, command, "--help")
+    code, out, err = run(capsys, command, "--help")
     assert (code, err) == (0, "") and f"example:\n  triline {command}" in out
     assert all(option in out for option in ("--json", "--quiet", "--verbose"))
-    code, out, err = run_main(capsys, command, "--wings")
+    code, out, err = run(capsys, command, "--wings")
     assert code == 2 and out == "" and err.splitlines()[-1].startswith("triline")
 
 
@@ -337,7 +322,7 @@ def test_what_a_command_cannot_help_is_one_line(tmp_path, capsys, monkeypatch):
 def test_settings_of_the_wrong_kind_are_refused(tmp_path, capsys, node, setting, text):
     settings = ["--set", setting] if "input" in setting else ["--set", "input=none.mcap", "--set", setting]
     settings = settings if node == "player" else ["--set", setting]
-    code, _, err = run_main(capsys, "node", node, *settings, "--port", free_port())
+    code, _, err = run(capsys, "node", node, *settings, "--port", free_port())
     assert code == 1 and text in err and len(err.splitlines()) == 1
 
 
@@ -350,7 +335,7 @@ def test_settings_of_the_wrong_kind_are_refused(tmp_path, capsys, node, setting,
     ],
 )
 def test_a_replay_of_nothing_is_refused(capsys, times, told):
-    code, out, err = run_main(capsys, "replay", simulated_flight(12), "-q", "--port", free_port(), *times)
+    code, out, err = run(capsys, "replay", simulated_flight(12), "-q", "--port", free_port(), *times)
     assert code == 1 and out == "" and len(err.splitlines()) == 1
     assert told in err and err.count("T") > 1
 
@@ -358,7 +343,7 @@ def test_a_replay_of_nothing_is_refused(capsys, times, told):
 def test_coordinates_outside_the_crs_are_named_with_their_place(tmp_path, capsys):
     write_block(tmp_path, simulated_block())
     (tmp_path / "project.toml").write_text('[project]\ncrs = "EPSG:4326"\n')  # metres taken for degrees
-    code, out, err = run_main(capsys, "adjust", tmp_path)
+    code, out, err = run(capsys, "adjust", tmp_path)
     assert code == 1 and out == "" and len(err.splitlines()) == 1
     assert "trajectory.csv:2: " in err and "outside the area of 'EPSG:4326'" in err
 

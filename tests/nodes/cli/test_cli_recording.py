@@ -17,6 +17,7 @@ import pytest
 import sample_messages as sample
 from bus_rig import Rig, simulated_flight, wait_for
 from bus_rig import triline as command
+from command_line import run
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
@@ -24,7 +25,7 @@ from recording_file import write_recording
 
 import triline
 from triline.nodes.bus.session import Bus
-from triline.nodes.cli import damage, main
+from triline.nodes.cli import damage
 from triline.nodes.cli.replay import _nobody
 from triline.nodes.convert import iso
 from triline.nodes.errors import UserError
@@ -38,16 +39,6 @@ from triline.nodes.step_driver import StepDriver
 from triline.schemas import codec
 from triline.schemas import messages as m
 from triline.schemas.envelope import Envelope, RawMessage
-
-
-def run(capsys, *arguments):
-    """Exit code, standard output, standard error."""
-    try:
-        code = main([str(a) for a in arguments])
-    except SystemExit as exit_:
-        code = exit_.code
-    out, err = capsys.readouterr()
-    return code, out, err
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import sample_messages as sample
+from command_line import run
 from rich.console import Console
-from test_bad_input_commands import run_main
 
 from triline.nodes.cli import main
 from triline.nodes.monitor.monitor import MOST_NODES, Monitor, screen
@@ -104,7 +104,7 @@ def _hostile_recording(path: Path) -> None:
 def test_no_control_character_of_a_recording_reaches_the_terminal(tmp_path, capsys, command):
     path = tmp_path / "flight\x1b[2J.mcap"
     _hostile_recording(path)
-    _, out, err = run_main(capsys, command[0], path, *command[1:])
+    _, out, err = run(capsys, command[0], path, *command[1:])
     assert _harmless(out) and _harmless(err)
     assert "\\x1b[2J" in out + err
     if command[0] == "info":
@@ -155,7 +155,7 @@ def test_parsers_that_give_up_are_told_in_one_line(block, capsys, name, text, wa
         long[-1] = "no number"
         text = "\n".join([head, first, *rest, ",".join(long)]) + "\n"
     path.write_text(text)
-    code, _, err = run_main(capsys, "adjust", block, "-o", block / "out")
+    code, _, err = run(capsys, "adjust", block, "-o", block / "out")
     if wanted:
         _one_line(code, err, name, wanted)
     else:
@@ -167,15 +167,15 @@ def test_numbers_too_large_for_a_double_are_refused_with_their_key(block, capsys
     (block / "camera.json").write_text(
         text.replace('"focal_length_mm": ', '"focal_length_mm": ' + "9" * 400 + ', "x": ', 1)
     )
-    code, _, err = run_main(capsys, "adjust", block, "-o", block / "out")
+    code, _, err = run(capsys, "adjust", block, "-o", block / "out")
     _one_line(code, err, "focal_length_mm", "wanted a number")
 
 
 def test_configuration_of_nodes_nested_too_deep_is_told_in_one_line(tmp_path, capsys):
     config = tmp_path / "nodes.toml"
     config.write_text(f"[adjuster]\n{DEEP_TOML}")
-    code, _, err = run_main(capsys, "node", "adjuster", "--config", config)
+    code, _, err = run(capsys, "node", "adjuster", "--config", config)
     _one_line(code, err, "nodes.toml", "nested too deep")
-    code, _, err = run_main(capsys, "node", "adjuster", "--set", "model=" + "[" * 5000)
+    code, _, err = run(capsys, "node", "adjuster", "--set", "model=" + "[" * 5000)
     _one_line(code, err, "configuration [adjuster]")
     assert len(err) < 1200

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from command_line import refusal
 from scene_pictures import LAT, LON, METRES, View, moved, relief, write_block, write_image
 
 from triline.nodes.batch.image_rectification import SourceImage
@@ -58,11 +59,8 @@ def rows(folder: Path, name: str = "image_points.csv") -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def refusal(capsys, *words) -> str:
-    assert main(["match", "-q", *map(str, words)]) == 1  # progress is told where the machine is slow
-    out = capsys.readouterr()
-    assert not out.out and out.err.count("\n") == 1 and "fault" not in out.err
-    return out.err
+def refused(capsys, *words) -> str:
+    return refusal(capsys, "match", "-q", *words)  # progress is told where the machine is slow
 
 
 def set_image(folder: Path, name: str, value: str) -> None:
@@ -143,7 +141,7 @@ def test_bands_are_put_together_and_values_of_any_kind_are_matched(block, capsys
     told = json.loads(capsys.readouterr().out)
     assert told["points"] > 20 and any("the mean of 3 bands" in note for note in told["notes"])
     set_image(block, "fore", 'image = "fore.tif"\nband = "2"')
-    assert "fore.tif: band '2': not in it, wanted 1 to 1" in refusal(capsys, block)
+    assert "fore.tif: band '2': not in it, wanted 1 to 1" in refused(capsys, block)
 
 
 def test_scenes_may_be_bands_of_one_file(block):
@@ -190,31 +188,31 @@ def test_heights_of_a_raster_are_taken(block, capsys):
     assert main([*words, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["points"] > 25 and told["heights_m"] == [-30.0, 30.0]
-    assert "--height and --dem" in refusal(capsys, *words[1:], "--height", 100, 300)
+    assert "--height and --dem" in refused(capsys, *words[1:], "--height", 100, 300)
 
 
 def test_bad_input_is_told_in_one_line(block, tmp_path, capsys):
-    assert "no block of satellite scenes" in refusal(capsys, tmp_path)
-    assert "--points 0: wanted 1" in refusal(capsys, block, "--points", 0)
-    assert "2 matched, fewer than 5 of them agree" in refusal(capsys, block, "--points", 2)
-    assert "--search-m -1: wanted more than 0" in refusal(capsys, block, "--search-m", -1)
-    assert "--dem-crs: goes with --dem" in refusal(capsys, block, "--dem-crs", "EPSG:4326")
-    assert "no folder" in refusal(capsys, block, "-o", tmp_path / "none" / "points.csv")
-    assert "--height 9 1: wanted the lowest" in refusal(capsys, block, "--height", 9, 1)
-    assert "would overwrite" in refusal(capsys, block, "-o", block / "fore.tif")
-    assert "would overwrite" in refusal(capsys, block, "-o", block / "project.toml")
+    assert "no block of satellite scenes" in refused(capsys, tmp_path)
+    assert "--points 0: wanted 1" in refused(capsys, block, "--points", 0)
+    assert "2 matched, fewer than 5 of them agree" in refused(capsys, block, "--points", 2)
+    assert "--search-m -1: wanted more than 0" in refused(capsys, block, "--search-m", -1)
+    assert "--dem-crs: goes with --dem" in refused(capsys, block, "--dem-crs", "EPSG:4326")
+    assert "no folder" in refused(capsys, block, "-o", tmp_path / "none" / "points.csv")
+    assert "--height 9 1: wanted the lowest" in refused(capsys, block, "--height", 9, 1)
+    assert "would overwrite" in refused(capsys, block, "-o", block / "fore.tif")
+    assert "would overwrite" in refused(capsys, block, "-o", block / "project.toml")
     (block / "cut.tif").write_bytes((block / "aft.tif").read_bytes()[:9000])
     set_image(block, "aft", 'image = "cut.tif"')
-    assert "cut.tif: lines " in refusal(capsys, block)
+    assert "cut.tif: lines " in refused(capsys, block)
     before = (block / "image_points.csv").read_text()
     assert before == MEASURED
     (block / "cut.tif").write_text("no image")
-    assert "cut.tif: not a raster that can be read" in refusal(capsys, block)
+    assert "cut.tif: not a raster that can be read" in refused(capsys, block)
     (block / "project.toml").write_text((block / "project.toml").read_text().replace('image = "cut.tif"', ""))
-    assert 'scenes.aft.image: missing, wanted its image: image = "IMG.TIF"' in refusal(capsys, block)
+    assert 'scenes.aft.image: missing, wanted its image: image = "IMG.TIF"' in refused(capsys, block)
     text = (block / "project.toml").read_text()
     (block / "project.toml").write_text(text[: text.index("[scenes.aft]")])
-    assert "one image, wanted two or more" in refusal(capsys, block)
+    assert "one image, wanted two or more" in refused(capsys, block)
 
 
 def test_a_folder_that_cannot_be_written_to_is_told_before_the_work(block, capsys, monkeypatch):
@@ -222,7 +220,7 @@ def test_a_folder_that_cannot_be_written_to_is_told_before_the_work(block, capsy
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != block or not mode & os.W_OK)
     monkeypatch.setattr("triline.nodes.cli.match.open_views", None)
     told = f"{block / 'image_points.csv'}: cannot be written: no permission in {block}\n"
-    assert refusal(capsys, block) == f"triline match: {told}"
+    assert refused(capsys, block) == f"triline match: {told}"
 
 
 def test_images_of_two_scenes_that_were_swapped_are_told(block, capsys):
@@ -241,14 +239,14 @@ def test_images_of_two_scenes_that_were_swapped_are_told(block, capsys):
 def test_an_image_may_be_one_pixel(block, capsys):
     write_image(block / "dot.tif", np.ones((1, 1), dtype=np.uint8))
     set_image(block, "fore", 'image = "dot.tif"\nfirst_pixel = [150, 150]')
-    assert "no texture where both may see the ground" in refusal(capsys, block)
+    assert "no texture where both may see the ground" in refused(capsys, block)
 
 
 def test_images_that_do_not_overlap_are_told(tmp_path, capsys):
     views = {"east": View(0, (0.0, 0.0), at_m=(5000.0, 0.0), lines=60, samples=60), "west": View(0, (0.1, 0.0))}
     views["west"] = replace(views["west"], lines=60, samples=60)
     write_block(tmp_path, views, views, 3)
-    assert "no two images overlap at heights from 100 to 400 m: east, west" in refusal(capsys, tmp_path)
+    assert "no two images overlap at heights from 100 to 400 m: east, west" in refused(capsys, tmp_path)
 
 
 def test_two_lenses_with_rigorous_models(tmp_path, capsys):
@@ -268,11 +266,11 @@ def test_two_lenses_with_rigorous_models(tmp_path, capsys):
     )
     project = (tmp_path / "project.toml").read_text()
     (tmp_path / "project.toml").write_text(project.replace('{ F = "F.tif", B = "B.tif" }', '"F.tif"'))
-    assert "scenes.pair.image: 'F.tif', wanted an image for each of the lines F, B" in refusal(capsys, tmp_path)
+    assert "scenes.pair.image: 'F.tif', wanted an image for each of the lines F, B" in refused(capsys, tmp_path)
     (tmp_path / "project.toml").write_text(project.replace("B = ", "N = "))
-    assert "scenes.pair.image.N: wanted one of the lines F, B" in refusal(capsys, tmp_path)
+    assert "scenes.pair.image.N: wanted one of the lines F, B" in refused(capsys, tmp_path)
     (tmp_path / "project.toml").write_text(project.replace("first_pixel = [10, 10]\n", ""))
-    assert "F.tif: 280 lines of 280 samples, wanted 300 of 300 as scene pair/F has" in refusal(capsys, tmp_path)
+    assert "F.tif: 280 lines of 280 samples, wanted 300 of 300 as scene pair/F has" in refused(capsys, tmp_path)
     (tmp_path / "project.toml").write_text(project)
     assert main(["match", str(tmp_path), "--points", "40", "--height", "0", "600", "--search-m", "120", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

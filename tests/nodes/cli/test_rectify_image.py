@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rasterio
+from command_line import refusal
 from places import DATA
 from relief import Waves
 from satellite_scenes import Truth, write_dimap2
@@ -60,10 +61,7 @@ def rectify(tmp_path, image, sensor, *more, name="ortho.tif"):
 
 
 def refused(capsys, *args) -> str:
-    assert main(["rectify", *map(str, args)]) == 1
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "fault in triline" not in error, error
-    return error
+    return refusal(capsys, "rectify", *args)
 
 
 # -- what comes out ------------------------------------------------------------------------------------------------

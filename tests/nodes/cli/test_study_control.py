@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import shutil
 from dataclasses import replace
 from itertools import pairwise
@@ -12,6 +11,7 @@ from types import SimpleNamespace as Names
 import numpy as np
 import pytest
 from block_writer import write_block
+from command_line import answer
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 
 from triline.nodes.batch.simulated_scenes import SceneSimulation, write_simulated_scenes
@@ -75,8 +75,7 @@ def pair(tmp_path_factory):
 
 
 def study(capsys, folder, *words):
-    assert main(["study", "control", str(folder), "--json", "--jobs", "1", *words]) == 0
-    return json.loads(capsys.readouterr().out)
+    return answer(capsys, "study", "control", folder, "--jobs", 1, *words)
 
 
 def as_adjusted(capsys, folder, found, row):
@@ -93,8 +92,7 @@ def as_adjusted(capsys, folder, found, row):
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    assert main(["adjust", str(copy), "--json", *row["options"].split()]) == 0
-    return json.loads(capsys.readouterr().out)
+    return answer(capsys, "adjust", copy, *row["options"].split())
 
 
 def same(row, result):

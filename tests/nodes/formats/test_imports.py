@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from block_writer import write_block
+from command_line import refusal
 from places import DATA, needs_data
 from small_block import FILES, simulated_block, write_files
 from tracks import ns, straight_track
@@ -388,11 +389,8 @@ def test_recordings_that_hold_no_block():
 # ---- what a user sees
 
 
-def _refused(capsys, *args: str) -> str:
-    assert main(["import", *args]) == 1
-    out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1 and err.startswith("triline import: ")
-    return err
+def _refused(capsys, *args: object) -> str:
+    return refusal(capsys, "import", *args)
 
 
 def test_foreign_files_get_one_line(tmp_path, capsys):

@@ -12,10 +12,9 @@ import time
 from pathlib import Path
 
 import pytest
+from recording_file import without_topics
 
 from triline.nodes.cli import batch, main
-from triline.nodes.recording.reader import RecordingReader
-from triline.nodes.recording.writer import RecordingWriter
 
 TRILINE = [sys.executable, "-m", "triline.nodes.cli"]
 #: Quick, and has no input but the recording.
@@ -204,10 +203,7 @@ def test_nodes_whose_work_failed_are_named(season, tmp_path, monkeypatch, capsys
 def test_a_flight_without_a_trajectory_has_failed(flown, tmp_path, monkeypatch, capsys):
     """It was done like any other, with a report of nothing."""
     monkeypatch.chdir(tmp_path)
-    with RecordingWriter(tmp_path / "f1.mcap") as writer:
-        for message in RecordingReader(flown).sorted_messages():
-            if message.topic != "sensor/attitude":
-                writer.write(message)
+    without_topics(flown, tmp_path / "f1.mcap", "sensor/attitude")
     assert main(["batch", "f1.mcap", "-o", "out", "--do", "process,analyze", "-q"]) == 1
     assert "/f1.mcap: no trajectory came out, so nothing is oriented: no usable message on" in capsys.readouterr().err
     assert not list(Path("out").rglob("processed.mcap")) and list(Path("out").rglob("process.log"))

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from driven_flight import SETTINGS
+from recording_file import write_recording
 
 from triline.nodes import convert
 from triline.nodes.cli import main
 from triline.nodes.node import Message
 from triline.nodes.recording.reader import RecordingReader
-from triline.nodes.recording.writer import RecordingWriter
 from triline.nodes.report.evaluation import evaluate
 from triline.nodes.simulator.flight_settings import simulated_flight
 from triline.nodes.simulator.simulator import Simulator
@@ -51,9 +51,7 @@ def flights(tmp_path_factory):
     for name, change in (("constant", lambda message: message), ("own", other_clock)):
         raw, out = folder / f"{name}.mcap", folder / f"{name}_out.mcap"
         messages = [change(m) for m in Simulator(flight.simulation, flight.imager).messages(EPOCH_NS)]
-        with RecordingWriter(raw, platform="test") as writer:
-            for message in sorted(messages, key=lambda m: m.stamp_ns):
-                writer.write(message)
+        write_recording(raw, sorted(messages, key=lambda m: m.stamp_ns), platform="test")
         assert main(["process", str(raw), "-o", str(out), "-q", "--nodes", "navigator,matcher,adjuster"]) == 0
         found[name] = raw, out
     return found

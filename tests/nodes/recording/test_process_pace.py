@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recording_file import write_recording
 
 from triline.nodes import convert, registry
 from triline.nodes.cli.process import at_pace
@@ -53,9 +54,7 @@ def recorded(tmp_path_factory, strip_s, rate_hz):
         plan = FlightPlan(strip_s=strip_s, lead_in_s=20.0 if inertial else 3.0)
         simulation = simulate(plan, 4, ErrorModel(attitude_rate_hz=rate_hz, gnss_rate_hz=5.0), inertial=inertial)
         path = tmp_path_factory.mktemp(kind) / "flight.mcap"
-        with RecordingWriter(path) as writer:
-            for message in Simulator(simulation).messages(EPOCH):
-                writer.write(message)
+        write_recording(path, Simulator(simulation).messages(EPOCH))
         found[kind] = simulation, path
     return found
 
@@ -197,9 +196,7 @@ def test_what_is_in_doubt_is_looked_at_more_often(tmp_path):
     nees = []
     for seed in (2, 4):
         simulation = simulate(plan, seed, replace(SETTINGS["rtk"], attitude_rate_hz=100.0), OBSERVED, world=world)
-        with RecordingWriter(path) as writer:
-            for message in Simulator(simulation).messages(EPOCH):
-                writer.write(message)
+        write_recording(path, Simulator(simulation).messages(EPOCH))
         done.write_bytes(processed(path, "throughput")[1])
         reader = RecordingReader(done)
         assert any("the attitude vibrates by" in m.body.message for m in reader.messages(["event/log"]))

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 import sample_messages as sample
+from bus_rig import here
 from places import ROOT
 
-from triline.nodes import cli
 from triline.nodes.bus.authority import Authority
 from triline.nodes.errors import UserError
 from triline.nodes.node import Message
@@ -22,13 +22,6 @@ from triline.nodes.recording.seal import verify
 from triline.nodes.recording.seal_place import seal_of
 from triline.schemas import codec
 from triline.schemas.envelope import Envelope, RawMessage
-
-
-def run_main(*arguments: object) -> int:
-    try:
-        return cli.main([str(a) for a in arguments]) or 0
-    except SystemExit as end:
-        return int(end.code or 0)
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +71,7 @@ def test_a_revocation_does_not_touch_seals_as_the_page_says(tmp_path, authority,
     before = recorded(tmp_path / "before.mcap", bundle)
     authority.revoke("lost")
     for signed in (before, recorded(tmp_path / "after.mcap", bundle)):
-        assert run_main("check", signed, "--authority", authority.folder) == 0
+        assert here("check", signed, "--authority", authority.folder) == 0
         assert "signed by 'lost' of 'survey'" in capsys.readouterr().out
 
 
@@ -86,9 +79,9 @@ def test_a_signed_recording_is_whole_and_says_by_whom(recording, authority, caps
     seal = verify(recording, authority.folder / "certificate.pem")
     assert seal is not None and seal.altered == [] and seal.signatures >= 4
     assert (seal.signer, seal.authority) == ("aircraft1", "survey")
-    assert run_main("check", recording, "--authority", authority.folder) == 0
+    assert here("check", recording, "--authority", authority.folder) == 0
     assert "signed by 'aircraft1' of 'survey'" in capsys.readouterr().out
-    assert run_main("info", recording) == 0
+    assert here("info", recording) == 0
     assert "nothing was altered" in capsys.readouterr().out
 
 
@@ -110,9 +103,9 @@ def test_a_message_changed_with_all_checksums_right_is_found_and_its_place_named
     assert seal is not None and len(seal.altered) == 1
     first, last = (int(word) for word in seal.altered[0].split()[1:4:2])
     assert first <= inside < last and "altered after they were signed" in seal.altered[0]
-    assert run_main("check", recording) == 1
+    assert here("check", recording) == 1
     assert "not as 'aircraft1' signed it: bytes" in capsys.readouterr().err
-    assert run_main("info", recording) == 0
+    assert here("info", recording) == 0
     assert "altered: bytes" in capsys.readouterr().out
 
 
@@ -163,10 +156,10 @@ def test_who_signs_must_be_certified_by_the_authority_that_is_asked_for(recordin
     assert "is not of who signed" in verify(recording).altered[0]
     for text in ("", "{}", "[" * 100_000, '{"triline_seal": 1, "certificate": 5}', '{"triline_seal": 9}'):
         seal_of(recording).write_text(text)
-        assert run_main("check", recording) == 1 and "seal" in capsys.readouterr().err, text[:10]
+        assert here("check", recording) == 1 and "seal" in capsys.readouterr().err, text[:10]
     seal_of(recording).unlink()
     assert verify(recording) is None
-    assert run_main("check", recording, "--authority", authority.folder) != 0
+    assert here("check", recording, "--authority", authority.folder) != 0
     assert "not signed" in capsys.readouterr().err
 
 

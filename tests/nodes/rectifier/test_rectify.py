@@ -14,7 +14,9 @@ import pandas as pd
 import pytest
 import rasterio
 import rasterio.warp
+from command_line import answer
 from notebook import Notebook
+from recording_file import without_topics
 from rio_cogeo.cogeo import cog_validate
 from scipy import ndimage
 from synthetic_flight import flight_messages
@@ -81,9 +83,7 @@ def dem(flown, folder):
 
 
 def _rectify(capsys, flown, target, *options):
-    capsys.readouterr()
-    assert main(["rectify", str(flown), "-o", str(target), "--json", *map(str, options)]) == 0
-    return json.loads(capsys.readouterr().out)
+    return answer(capsys, "rectify", flown, "-o", target, *options)
 
 
 def test_orthoimage_shows_the_ground_where_it_is(flown, simulated, dem, folder, capsys):
@@ -524,14 +524,8 @@ def test_a_map_whose_datum_shift_is_not_here(flown, folder, capsys, mosaic):
 
 
 def test_recordings_that_cannot_be_rectified(flown, folder, capsys):
-    reader = RecordingReader(flown)
-
     def without(name, *gone):
-        with RecordingWriter(folder / name) as writer:
-            for message in reader.sorted_messages():
-                if not message.topic.startswith(gone) and not message.topic.startswith("orthoimage"):
-                    writer.write(message)
-        return folder / name
+        return without_topics(flown, folder / name, "orthoimage", *gone)
 
     def refused(path, *options):
         assert main(["rectify", str(path), "-o", str(folder / "no.tif"), *options]) == 1
