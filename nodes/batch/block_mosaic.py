@@ -97,7 +97,7 @@ def _is_empty(path: Path) -> bool:
     return not isinstance(read_json(path), dict)
 
 
-def check_layers(layers: list[Layer]) -> None:
+def _check_layers(layers: list[Layer]) -> None:
     """Refuse layers that cannot be put together.
 
     Raises
@@ -153,7 +153,7 @@ def make_mosaic(
     ------
     UserError : of a job
     """
-    check_layers(layers)
+    _check_layers(layers)
     tiles = tiles_of(layers)
     for name in ("tones", "labels", "tiles"):
         (folder / name).mkdir(exist_ok=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -26,6 +25,7 @@ from ..errors import UserError
 from ..formats.geotiff import BLOCK, SIGMA_BANDS, Raster, tiled_orthoimage
 from ..formats.height_raster import HeightRaster, RasterFile
 from ..formats.raster_open import check_grey_values, open_raster
+from ..worker_pool import cores
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]
@@ -209,7 +209,7 @@ class ImageRectification:
     occlusions: bool = False
     direct: bool = False
     tolerance_px: float = 0.005
-    workers: int = field(default_factory=lambda: len(os.sched_getaffinity(0)))
+    workers: int = field(default_factory=cores)
     ellipsoid: Ellipsoid = WGS84
     counts: Counts = field(default_factory=Counts)
 

@@ -24,6 +24,7 @@ from ..jobs.pools import LocalPool, Pool
 from ..jobs.steps import STEPS, USUAL
 from ..jobs.work import Outcome, remove_working_folders
 from ..terminal import drawing, plain, redraws
+from ..worker_pool import cores
 
 EXAMPLE = """triline batch season/ -o results --workers 4
   triline batch 'season/*/flight.mcap' -o results --do process,adjust,analyze --with 'adjust --snoop --plots'
@@ -59,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     begun = time.monotonic()
-    workers = (os.cpu_count() or 1) if args.workers is None else args.workers
+    workers = cores() if args.workers is None else args.workers
     if workers < 1:
         raise UserError(f"--workers {args.workers}: wanted 1 at least")
     if args.retries < 0:

@@ -22,7 +22,6 @@ from ..batch.block_mosaic import (
     MosaicSettings,
     Outputs,
     balance_left_out,
-    check_layers,
     empty_layers,
     layers_in,
     make_mosaic,
@@ -48,6 +47,7 @@ from ..formats.stac import write_stac_item
 from ..recording.access import Recording
 from ..recording.reader import RecordingReader
 from ..recording.same_flight import beginning_alike
+from ..worker_pool import cores
 from . import rectify_image
 from .damage import tell_damage, tell_other_camera, tell_other_frame
 from .heights_under import rasters_of_heights
@@ -107,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
     begun = time.perf_counter()
     outputs = _outputs(args)
     _check(args, outputs)
-    workers = args.workers or len(os.sched_getaffinity(0))
+    workers = args.workers or cores()
     kinds = _kinds(args)
     _refuse_without_effect(args, {kind for kind, _, _ in kinds})
     _refuse_inputs(args, outputs, kinds)
@@ -130,7 +130,6 @@ def run(args: argparse.Namespace) -> int:
         with progress("rectifying", args.quiet or args.json) as told:
             before = pool.run(layer_job, jobs, told)
         layers = layers_in(folder)
-        check_layers(layers)
         with progress("mosaic", args.quiet or args.json) as told:
             counts = make_mosaic(folder, layers, settings, pool, told)
     tags = {"TIFFTAG_IMAGEDESCRIPTION": f"mosaic of {len(layers)} layers, balance {settings.balance}"}

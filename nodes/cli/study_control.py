@@ -24,6 +24,7 @@ from ..formats.json_text import json_text, plain
 from ..formats.new_file import new_file, refuse_unless_writable
 from ..formats.scene_block import is_scene_block, read_scene_block
 from ..formats.table import write_table
+from ..worker_pool import cores
 from .adjust import read_input
 from .control_runs import (
     AirborneBlock,
@@ -34,7 +35,6 @@ from .control_runs import (
     SceneBlock,
     Settings,
     Work,
-    cores,
     default_numbers,
     pool_of,
     run_all,
