@@ -151,8 +151,7 @@ def usual_pace(reader: RecordingReader, nodes: Sequence[str]) -> str:
     """
     if ADJUSTER not in nodes or not set(nodes) <= FAST:
         return "load"
-    held = set(reader.index.channel.tolist())
-    topics = {c.topic for c in reader.channels.values() if c.known and c.id in held}
+    topics = reader.topics_with_messages()
     if f"status/{ADJUSTER}" in topics:
         return "load"
     if REPORT not in topics:

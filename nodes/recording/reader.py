@@ -352,6 +352,11 @@ class RecordingReader:
                     content, of_chunk = self._buffer if chunk < 0 else self._content(chunk), chunk
                 yield channels[of], stamp, sequence, scan.payload_at(content, place), receive
 
+    def topics_with_messages(self) -> set[str]:
+        """Known topics that have messages: a file can announce a channel whose chunks are gone."""
+        held = set(self._index.channel.tolist())
+        return {c.topic for c in self.channels.values() if c.known and c.id in held}
+
     def select(self, wanted: Iterable[str] | None = None) -> NDArray[np.int64]:
         """Numbers of the messages of some topics (all known topics where none are named), in file order.
 

@@ -151,9 +151,7 @@ def process(
     copy = copy or (lambda messages: _each(write, messages))
     write = _as_recorded(write)
     summary = ProcessSummary()
-    held = set(reader.index.channel.tolist())  # a channel can be announced by a file whose chunks are gone
-    recorded = {c.topic for c in reader.channels.values() if c.known and c.id in held}
-    running = active_nodes(nodes, recorded)
+    running = active_nodes(nodes, reader.topics_with_messages())
     summary.nodes = [node.name for node in running]
     made = {name for node in running for name in node.outputs}
     drivers = [StepDriver(node) for node in running]

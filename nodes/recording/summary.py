@@ -204,8 +204,7 @@ def not_whole(reader: RecordingReader) -> list[str]:
 
 def held_topics(reader: RecordingReader) -> str:
     """The topics of which a recording has messages, in words."""
-    present = set(reader.index.channel.tolist())
-    held = sorted({c.topic for c in reader.channels.values() if c.known and c.id in present})
+    held = sorted(reader.topics_with_messages())
     return f"it holds {', '.join(held)}" if held else "it holds no message"
 
 
