@@ -15,6 +15,7 @@ count less, the worse they fit, and the worst not at all.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -268,23 +269,25 @@ def _prior(m: int, fall_off: Mask, level: float) -> tuple[Array, Array]:
 def _reduced(A: csr_array, slope: Array, residual: Array, w: Array, of_place: csr_array) -> tuple[Array, Array]:
     """Normal equations of the parameters after the radiances are eliminated."""
     weighted = A * w[:, None]
-    B = of_place * (slope * w)[None, :]  # places by values: B'W of the one unknown a place
-    own = of_place @ (slope**2 * w)
-    inverse = np.where(own > 0, 1.0 / np.where(own > 0, own, 1.0), 0.0)
-    cross = csr_array(B @ A)  # places by parameters
+    B, inverse, cross = _of_radiances(A, slope, w, of_place)
     N = (A.T @ weighted).toarray() - (cross.T @ (cross * inverse[:, None])).toarray()
     n = np.asarray(weighted.T @ residual) - np.asarray(cross.T @ (inverse * (B @ residual)))
     return N, n
+
+
+def _of_radiances(A: csr_array, slope: Array, w: Array, of_place: csr_array) -> tuple[Any, Array, csr_array]:
+    """Normal equations of the radiances, one unknown a place: design by weights (places by values), the inverse of
+    their own part (places,), and the part that they share with the parameters (places by parameters)."""
+    B = of_place * (slope * w)[None, :]
+    own = of_place @ (slope**2 * w)
+    return B, np.where(own > 0, 1.0 / np.where(own > 0, own, 1.0), 0.0), csr_array(B @ A)
 
 
 def _sandwich(
     A: csr_array, slope: Array, residual: Array, w: Array, of_place: csr_array, group: IntArray, N: Array, prior: Array
 ) -> Array:
     """Covariance: inverse normal equations around the scatter of the scores of groups, and the information a priori."""
-    B = of_place * (slope * w)[None, :]
-    own = of_place @ (slope**2 * w)
-    inverse = np.where(own > 0, 1.0 / np.where(own > 0, own, 1.0), 0.0)
-    cross = csr_array(B @ A)
+    B, inverse, cross = _of_radiances(A, slope, w, of_place)
     score = csr_array(of_place @ (A * (w * residual)[:, None])) - cross * (inverse * (B @ residual))[:, None]
     groups, at = np.unique(group, return_inverse=True)
     join = csr_array((np.ones(len(group)), (at, np.arange(len(group)))), shape=(len(groups), len(group)))
