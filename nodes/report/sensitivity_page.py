@@ -12,10 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
+from numpy.typing import NDArray
 
 from ...solver.sensitivity.scene_map import SceneMap
 from .render import drawing, render
 from .style import figure, styled
+
+Array = NDArray[np.floating] | NDArray[np.int64]
 
 #: Colours of parameters, by their place among those of the scene.
 _COLORS = (
@@ -77,7 +80,7 @@ def _map(found: SceneMap, row_names: list[str] | None) -> Figure | None:
     left.autoscale_view()
     left.margins(0.03)
     left.grid(visible=False)
-    _ticks(left, found, across, down, row_names)
+    _ticks(left, found, found.columns / across, -found.rows / down, row_names)
     left.set_title(f"error ellipses (1 sigma, north up); the largest has {np.nanmax(larger):.3g} m")
     entries = [Line2D([], [], color=_COLORS[k % len(_COLORS)], marker="o", ls="", label=found.names[k]) for k in names]
     left.legend(handles=entries, title="dominates", loc="upper left", bbox_to_anchor=(1.0, 1.0))
@@ -91,32 +94,24 @@ def _map(found: SceneMap, row_names: list[str] | None) -> Figure | None:
             color = "white" if image.norm(found.sigma[i, j]) < 0.7 else "black"  # viridis ends in yellow
             right.text(j, i, f"{100 * found.share[i, j, k]:.0f} %", ha="center", va="center", fontsize=5.5, color=color)
     right.grid(visible=False)
-    some = np.unique(np.linspace(0, len(found.columns) - 1, 5).round().astype(int))
-    right.set_xticks(some, [f"{found.columns[k]:.0f}" for k in some])
-    rows = (
-        np.arange(len(found.rows))
-        if row_names
-        else np.unique(np.linspace(0, len(found.rows) - 1, 5).round().astype(int))
-    )
-    right.set_yticks(rows, row_names or [f"{found.rows[k]:.0f}" for k in rows])
-    right.set_xlabel("column")
-    right.set_ylabel("line of detectors" if row_names else "row")
+    _ticks(right, found, np.arange(len(found.columns)), np.arange(len(found.rows)), row_names)
     right.set_title("planimetric sigma, and the share of what dominates")
     fig.colorbar(image, ax=right, label="m")
     return fig
 
 
-def _ticks(ax: Axes, found: SceneMap, across: float, down: float, row_names: list[str] | None) -> None:
-    some = np.unique(np.linspace(0, len(found.columns) - 1, 5).round().astype(int))
-    ax.set_xticks(found.columns[some] / across, [f"{found.columns[k]:.0f}" for k in some])
-    rows = (
-        np.arange(len(found.rows))
-        if row_names
-        else np.unique(np.linspace(0, len(found.rows) - 1, 5).round().astype(int))
-    )
-    ax.set_yticks(-found.rows[rows] / down, row_names or [f"{found.rows[k]:.0f}" for k in rows])
+def _ticks(ax: Axes, found: SceneMap, x: Array, y: Array, row_names: list[str] | None) -> None:
+    """Five columns and five rows of the map, or all named ones, at their places ``x`` and ``y`` in the axes."""
+    columns = _five_of(len(found.columns))
+    rows = np.arange(len(found.rows)) if row_names else _five_of(len(found.rows))
+    ax.set_xticks(x[columns], [f"{found.columns[k]:.0f}" for k in columns])
+    ax.set_yticks(y[rows], row_names or [f"{found.rows[k]:.0f}" for k in rows])
     ax.set_xlabel("column")
     ax.set_ylabel("line of detectors" if row_names else "row")
+
+
+def _five_of(n: int) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, n - 1, 5).round().astype(np.int64))
 
 
 def _shares(result: dict[str, Any]) -> Figure:
