@@ -1,17 +1,20 @@
-"""What a command must not write to, or over."""
+"""What commands write: what they must not write to or over, and pictures."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import UserError
-from ..formats.new_file import refuse_unless_writable
+from ..formats.new_file import new_file, refuse_unless_writable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def refuse_empty_words(argv: list[str]) -> None:
@@ -93,6 +96,14 @@ def refuse_unless_picture(path: Path) -> None:
     refuse_unless_writable(path)
     if path.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise UserError(f"--plot {path}: wanted a name that ends in .png, .svg or .pdf")
+
+
+def write_picture(path: Path, draw: Callable[[], Figure], dpi: int) -> None:
+    """Write what ``draw`` draws in the style of the pages, in the format that the name of ``--plot`` says."""
+    from ..report.style import styled  # draws with matplotlib
+
+    with styled(), new_file(path) as part:
+        draw().savefig(part, format=path.suffix.lstrip(".").lower(), dpi=dpi)
 
 
 #: Ends of names that say a format: of rasters, tables, vectors, pages and what this program writes itself.

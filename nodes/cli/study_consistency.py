@@ -51,7 +51,7 @@ def _plain(c: Consistency) -> dict[str, object]:
         "rmse_over_sigma_sigma": c.points_sigma.tolist(),
         "orientation_nees": c.orientation,
         "orientation_nees_band": list(c.band),
-        "camera_nees": None if math.isnan(c.parameters) else c.parameters,
+        "camera_nees": c.parameters,
         "sigma0": c.sigma0,
         "chi_square_passed": c.passed,
         "chi_square_passed_band": list(c.passed_band),

@@ -41,7 +41,7 @@ from .control_runs import (
     with_control,
 )
 from .control_verdict import Row, Study, judge, metres, verdict
-from .outputs import refuse_unless_picture
+from .outputs import refuse_unless_picture, write_picture
 from .progress import progress
 
 EXAMPLE = """triline study control block/ --snoop --plot control.png
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
     if args.csv:
         _write_csv(args.csv, study)
     if args.plot:
-        _plot(args.plot, study)
+        write_picture(args.plot, lambda: _figure(study), dpi=130)
     if args.page:
         _page(args.page, study)
     if args.json:
@@ -324,13 +324,6 @@ def _figure(study: Study) -> Any:
     shown += [Line2D([], [], marker="o", linestyle="", label="best", **ring)] if study.best else []
     fig.legend(handles=shown, loc="outside lower center", ncols=len(shown), fontsize=7.5)
     return fig
-
-
-def _plot(path: Path, study: Study) -> None:
-    from ..report.style import styled
-
-    with styled(), new_file(path) as part:
-        _figure(study).savefig(part, format=path.suffix.lstrip(".").lower(), dpi=130)
 
 
 def _page(path: Path, study: Study) -> None:

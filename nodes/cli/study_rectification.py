@@ -20,7 +20,7 @@ from ..errors import UserError, flag
 from ..formats.json_text import json_text
 from ..formats.new_file import new_file, refuse_unless_writable
 from ..formats.table import write_table
-from .outputs import refuse_unless_picture
+from .outputs import refuse_unless_picture, write_picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     if args.csv:
         _write_csv(Path(args.csv), tables)
     if args.plot:
-        _plot(Path(args.plot), tables)
+        write_picture(Path(args.plot), lambda: _figure(tables), dpi=120)
     if args.page:
         _page(Path(args.page), args, tables, starts)
     if args.json:
@@ -96,14 +96,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _plain(got: Compared) -> dict[str, Any]:
     return {
-        "rmse_east_m": _number(got.rmse_m[0]), "rmse_north_m": _number(got.rmse_m[1]),
-        "control_rmse_east_m": _number(got.control_rmse_m[0]), "control_rmse_north_m": _number(got.control_rmse_m[1]),
-        "seconds": _number(got.seconds), "failed": got.failed,
+        "rmse_east_m": got.rmse_m[0], "rmse_north_m": got.rmse_m[1], "control_rmse_east_m": got.control_rmse_m[0],
+        "control_rmse_north_m": got.control_rmse_m[1], "seconds": got.seconds, "failed": got.failed,
     }  # fmt: skip
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _text(args: argparse.Namespace, tables: dict[str, dict[str, Compared]], starts: dict[str, Compared]) -> str:
@@ -135,11 +130,14 @@ def _rmse(got: Compared, none: str) -> str:
 
 
 def _write_csv(path: Path, tables: dict[str, dict[str, Compared]]) -> None:
-    rows = [(scene, name, *_plain(got).values()) for scene, table in tables.items() for name, got in table.items()]
-    keys = ("scene", "method", *_plain(next(iter(next(iter(tables.values())).values()))))
-    columns = {key: [np.nan if row[k] is None else row[k] for row in rows] for k, key in enumerate(keys)}
+    rows = [
+        {"scene": scene, "method": name, **_plain(got)}
+        for scene, table in tables.items()
+        for name, got in table.items()
+    ]
+    formats = dict.fromkeys((key for key in rows[0] if key.endswith("_m")), ".3f") | {"seconds": ".6f"}
     with new_file(path) as part:
-        write_table(part, columns, dict.fromkeys((k for k in keys if k.endswith("_m")), ".3f") | {"seconds": ".6f"})
+        write_table(part, {key: [row[key] for row in rows] for key in rows[0]}, formats)
 
 
 def _figure(tables: dict[str, dict[str, Compared]]) -> Figure:
@@ -157,13 +155,6 @@ def _figure(tables: dict[str, dict[str, Compared]]) -> Figure:
     axes.set_ylabel("RMSE of check points, m")
     axes.legend()
     return fig
-
-
-def _plot(path: Path, tables: dict[str, dict[str, Compared]]) -> None:
-    from ..report.style import styled
-
-    with styled(), new_file(path) as part:
-        _figure(tables).savefig(part, format=path.suffix.lstrip(".").lower(), dpi=120)
 
 
 def _page(

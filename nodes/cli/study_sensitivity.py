@@ -45,7 +45,7 @@ from ...solver.sensitivity.study import Study, study
 from ...solver.simulation.orbital_scene import ORBITAL_SENSORS, overpass
 from ..errors import UserError
 from ..formats.frame_json import is_frame_json, read_frame
-from ..formats.json_text import json_text
+from ..formats.json_text import json_text, plain
 from ..formats.new_file import new_file, refuse_unless_writable
 from ..formats.satellite.read import read_scene
 from ..formats.table import write_table
@@ -299,11 +299,11 @@ def _as_table(scene: _Scene, found: Study) -> dict[str, Any]:
                     "sigma": float(scene.inputs.sigma[j]),
                     "derivative": float(found.covariance.jacobian[k, j]),
                     "moves_m": float(abs(found.covariance.jacobian[k, j]) * scene.inputs.sigma[j]),
-                    "share": _number(found.covariance.share[k, j]),
-                    "fast_first": _number(found.fast.first[k, j]),
-                    "fast_total": _number(found.fast.total[k, j]),
-                    "sobol_first": _number(found.sobol.first[k, j]),
-                    "sobol_total": _number(found.sobol.total[k, j]),
+                    "share": plain(found.covariance.share[k, j]),
+                    "fast_first": plain(found.fast.first[k, j]),
+                    "fast_total": plain(found.fast.total[k, j]),
+                    "sobol_first": plain(found.sobol.first[k, j]),
+                    "sobol_total": plain(found.sobol.total[k, j]),
                 }
                 for j, name in enumerate(scene.inputs.names)
             },
@@ -335,10 +335,6 @@ def _as_map(scene: _Scene, found: SceneMap) -> list[dict[str, Any]]:
             "dominating": found.names[k], "share": float(found.share[i, j, k]),
         })  # fmt: skip
     return out
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _as_text(table: dict[str, Any]) -> str:
