@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .robust_plane import robust_plane
+
 Array = NDArray[np.floating]
 
 #: A match that is off by so many robust standard deviations is wrong; and by how many pixels at least, before it is.
@@ -186,14 +188,4 @@ def _robust_fit(design: Array, values: Array) -> tuple[Array, float]:
     known = np.isfinite(values)
     if known.sum() < FEWEST // 2:
         return np.zeros(design.shape[1]), np.inf
-    A, b = design[known], values[known]
-    # a little regularisation: slopes stay small where the points do not decide them
-    damping = np.diag([0.0, 0.05, 0.05]) * len(b)
-    fit = np.array([np.median(b), 0.0, 0.0])
-    scale = LEAST_SCALE_PX
-    for _ in range(8):
-        left = b - A @ fit
-        scale = max(1.4826 * float(np.median(np.abs(left))), LEAST_SCALE_PX)
-        w = 1.0 / (1.0 + (left / (2.0 * scale)) ** 2) ** 2
-        fit = np.linalg.solve(A.T @ (A * w[:, None]) + damping + 1e-9 * np.eye(3), A.T @ (w * b))
-    return fit, scale
+    return robust_plane(design[known], values[known], LEAST_SCALE_PX, 8, slope_weight=0.05)

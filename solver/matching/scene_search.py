@@ -17,6 +17,7 @@ from scipy.ndimage import uniform_filter
 from scipy.spatial import KDTree
 
 from .correlation import best_place, correlate
+from .robust_plane import robust_plane
 from .scene_patches import ScenePatches, SceneView, mapping, parallaxes, transferred
 from .search import COARSEST, REACH_PX, Found, Ground, Patches, find
 
@@ -225,12 +226,7 @@ def plane_fit(place: Array, values: Array, floor: float) -> tuple[Array, float]:
         return np.full(len(values), level), max(1.4826 * float(np.median(np.abs(values - level))), floor)
     middle, size = place.mean(axis=0), max(float(np.ptp(place, axis=0).max()), 1.0)
     A = np.column_stack([np.ones(len(place)), (place - middle) / size])
-    fit, scale = np.array([np.median(values), 0.0, 0.0]), floor
-    for _ in range(10):
-        left = values - A @ fit
-        scale = max(1.4826 * float(np.median(np.abs(left))), floor)
-        w = 1.0 / (1.0 + (left / (2.0 * scale)) ** 2) ** 2
-        fit = np.linalg.solve(A.T @ (A * w[:, None]) + 1e-9 * np.eye(3), A.T @ (w * values))
+    fit, scale = robust_plane(A, values, floor, 10)
     return A @ fit, scale
 
 
