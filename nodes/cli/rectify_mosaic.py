@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +63,8 @@ OPTIONS = ("tile", "balance", "seams", "feather", "source", "seam_lines", "input
 FIRST_UTC_S = 2 * 365 * 86400
 #: Ends of the names of recordings; everything else is an image.
 _RECORDINGS = (".mcap",)
+#: Recordings that a process keeps ready at most.
+KEPT_RECORDINGS = 2
 #: Options of images and recordings that a mosaic of several does not take.
 _NOT_OF_MOSAIC = {
     "trajectory": "recording",
@@ -74,6 +75,10 @@ _NOT_OF_MOSAIC = {
 _OF_IMAGES = ("model", "dem_datum", "nodata", "position_sigma", "attitude_sigma")
 _OF_RECORDINGS = ("orientation", "camera", "strip")
 _OF_BOTH = ("dem", "dem_crs", "height", "occlusions", "refraction", "ccd", "pixel_sigma", "height_sigma")
+
+
+#: Those that are ready, by the words that say all that they depend on.
+_prepared: dict[str, Prepared] = {}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -276,7 +281,7 @@ def _cells(args: argparse.Namespace, kinds: list[tuple[str, Path, str | None]]) 
                 raise UserError(f"{path}: has no coordinate reference system; wanted an orthoimage, or --sensor")
             found = source.crs.to_string(), abs(source.transform.a)
         elif kind == "recording":
-            of = _prepared_of(args, path)
+            of = prepared(args, path)
             found = of.target.crs, cells_of(args, of)[0].gsd
         else:
             grid = rectify_image.cells_of(_for_image(args, path, meta, crs, gsd, None, None))
@@ -391,36 +396,21 @@ def _for_image(
     return of
 
 
-def _prepared_of(args: argparse.Namespace, path: Path) -> Prepared:
-    of = copy.copy(args)
-    of.input = path
-    return prepared(of, path)
-
-
-@lru_cache(maxsize=2)
-def _prepared_once(words: str, path: Path, args: _Held) -> Prepared:
-    """The last recordings of this process: its strips are jobs one after another."""
-    return _prepared_of(args.args, path)
-
-
-class _Held:
-    """Options, all alike for a cache that goes by their words."""
-
-    def __init__(self, args: argparse.Namespace) -> None:
-        self.args = args
-
-    def __hash__(self) -> int:
-        return 0
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Held)
+def _prepared_once(args: argparse.Namespace, path: Path) -> Prepared:
+    """A recording that is ready; the last ones are kept, since their strips are jobs one after another."""
+    stamp = path.stat()
+    words = f"{path} {vars(args)} {stamp.st_size} {stamp.st_mtime_ns}"
+    if words not in _prepared:
+        while len(_prepared) >= KEPT_RECORDINGS:
+            del _prepared[next(iter(_prepared))]
+        _prepared[words] = prepared(args, path)
+    return _prepared[words]
 
 
 def _layer_of_strip(
     args: argparse.Namespace, path: Path, name: str, strip: str, folder: Path, stem: str, settings: MosaicSettings
 ) -> Layer | None:
-    stamp = path.stat()
-    of = _prepared_once(f"{vars(args)} {stamp.st_size} {stamp.st_mtime_ns}", path, _Held(args))
+    of = _prepared_once(args, path)
     grid = GroundGrid(of.target, settings.gsd)
     factor = pixels_together(grid, of.pixel_m)
     held: list[SpillingMosaic] = []
