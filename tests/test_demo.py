@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from bus_rig import free_port, wait_for
+from recording_file import bodies_of
 
 from triline.nodes.bus.session import Bus
 from triline.nodes.cli.demo import PLATFORM
@@ -23,11 +24,6 @@ RESULTS = (
     "orientation/final", "point/object",
 )  # fmt: skip
 NODES = "navigator,matcher,adjuster"
-
-
-def bodies(path: Path, topic: str) -> list[tuple[int, bytes]]:
-    messages = RecordingReader(path).sorted_messages([topic])
-    return [(m.stamp_ns, m.body.SerializeToString(deterministic=True)) for m in messages]
 
 
 def process(recording: Path, output: Path) -> Path:
@@ -98,7 +94,7 @@ def test_live_orientation_is_what_process_makes_of_the_recording(demo, tmp_path)
     folder, _ = demo
     processed = process(folder / "flight.mcap", tmp_path / "processed.mcap")
     for topic in RESULTS:
-        live, again = bodies(folder / "flight.mcap", topic), bodies(processed, topic)
+        live, again = bodies_of(folder / "flight.mcap", topic), bodies_of(processed, topic)
         assert len(live) > (60 if topic == "observation/target" else 100)
         assert live == again, f"{topic} differs"
 
@@ -106,7 +102,7 @@ def test_live_orientation_is_what_process_makes_of_the_recording(demo, tmp_path)
 def test_a_flight_that_waits_for_its_nodes_has_a_time_of_its_own(demo):
     """So that a seed gives the same results each time: they follow from the sensors' messages alone (see above)."""
     folder, _ = demo
-    stamps = [stamp_ns for stamp_ns, _ in bodies(folder / "flight.mcap", "sensor/attitude")]
+    stamps = [stamp_ns for stamp_ns, _ in bodies_of(folder / "flight.mcap", "sensor/attitude")]
     assert stamps[0] == DEFAULT_EPOCH_NS
     assert {stamp_ns - stamps[0] for stamp_ns in stamps} == {round(i / 200 * 1e9) for i in range(len(stamps))}
 
@@ -124,8 +120,8 @@ def test_the_same_seed_gives_the_same_results_on_a_busy_machine(tmp_path):
                 other.kill()
     for topic in (*RESULTS, "orientation/whole", "orthoimage/final", "event/log"):
         idle, loaded = (
-            bodies(tmp_path / "idle" / "flight.mcap", topic),
-            bodies(tmp_path / "busy" / "flight.mcap", topic),
+            bodies_of(tmp_path / "idle" / "flight.mcap", topic),
+            bodies_of(tmp_path / "busy" / "flight.mcap", topic),
         )
         assert idle and idle == loaded, topic
 
@@ -191,9 +187,9 @@ def test_nodes_killed_in_turn_are_started_again_and_the_flight_is_kept(tmp_path)
     recovered = tmp_path / "recovered.mcap"
     command = [sys.executable, "-m", "triline.nodes.cli", "recover", str(cut), "-o", str(recovered), "-q"]
     assert subprocess.run(command, capture_output=True, timeout=900).returncode == 0
-    attitude = bodies(recovered, "sensor/attitude")
+    attitude = bodies_of(recovered, "sensor/attitude")
     assert len(attitude) > 1000  # how far it was by then depends on the machine
     # the second recording explains itself and holds results of the restarted nodes
     rest = max((Path(p) for p in result["recordings"]), key=lambda p: p.stat().st_mtime)
-    assert bodies(rest, "configuration/camera") and bodies(rest, "observation/control")
-    assert len(bodies(rest, "orientation/final")) > 50
+    assert bodies_of(rest, "configuration/camera") and bodies_of(rest, "observation/control")
+    assert len(bodies_of(rest, "orientation/final")) > 50

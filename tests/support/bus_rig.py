@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import zenoh
 
@@ -54,11 +55,13 @@ def simulated_flight(seconds: int = 8, attitude_hz: int = 200) -> Path:
 PATIENCE = 6.0
 
 
-def wait_for(condition: Callable[[], object], timeout_s: float = 10.0, what: str = "the condition") -> None:
+def wait_for(condition: Callable[[], Any], timeout_s: float = 10.0, what: str = "the condition") -> Any:
+    """What a question gives as soon as it gives anything."""
     until = time.monotonic() + PATIENCE * timeout_s
-    while not condition():
+    while not (found := condition()):
         assert time.monotonic() < until, f"{what} did not come within {PATIENCE * timeout_s:g} s"
         time.sleep(0.02)
+    return found
 
 
 def wait_for_nodes(bus: Bus, *names: str) -> None:

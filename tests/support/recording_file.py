@@ -33,6 +33,12 @@ def payloads(path: Path, topic: str) -> list[tuple[int, int, bytes]]:
     return [(raw.envelope.stamp_ns, raw.envelope.sequence, bytes(raw.data)) for raw in raws]
 
 
+def bodies_of(path: Path, topic: str) -> list[tuple[int, bytes]]:
+    """Stamp and content of the messages of a topic, in order; the same content gives the same bytes."""
+    messages = RecordingReader(path).sorted_messages([topic])
+    return [(message.stamp_ns, message.body.SerializeToString(deterministic=True)) for message in messages]
+
+
 def chunk_spans(path: Path) -> list[tuple[int, int]]:
     """Where each chunk of a whole recording begins and ends, as the MCAP library reads it in the summary."""
     with open(path, "rb") as file:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from stepped_node import stepped
 
 from triline.nodes import convert
 from triline.nodes.adjuster.adjuster import Adjuster
@@ -41,14 +42,10 @@ def flight():
     return simulation, messages
 
 
-def run(node, messages):
-    return [o for message in messages for o in node.step(message)] + list(node.finish())
-
-
 @pytest.fixture(scope="module")
 def done(flight):
     node = Adjuster(grid_hz=10.0)
-    return node, run(node, flight[1])
+    return node, stepped(node, flight[1])
 
 
 def bodies(outputs, topic):
@@ -131,7 +128,7 @@ def test_the_operator_is_told_what_the_result_rests_on(done, flight):
     texts = [b.message for b in bodies(done[1], "event/log")]
     assert texts[0] == "strip S1 began" and "strip S1 ended" in texts
     assert any(t.startswith("weak: no tie points") for t in texts) and "good" in texts
-    blind = run(Adjuster(grid_hz=2.0, **SELDOM), [x for x in flight[1] if x.topic != "observation/control"])
+    blind = stepped(Adjuster(grid_hz=2.0, **SELDOM), [x for x in flight[1] if x.topic != "observation/control"])
     last = [b.message for b in bodies(blind, "event/log") if b.message.startswith(("good", "weak", "failed"))]
     assert "good" not in last[:-1]
     in_flight = [text for text in last if "over: " not in text]
@@ -168,7 +165,7 @@ def test_a_strip_that_is_flown_again_under_its_name_is_told_and_left_out(done, f
 
 
 def test_same_messages_same_bytes(done, flight):
-    again = run(Adjuster(grid_hz=10.0), flight[1])
+    again = stepped(Adjuster(grid_hz=10.0), flight[1])
     first, second = (
         [(o.topic, o.stamp_ns, o.body.SerializeToString(deterministic=True)) for o in outputs]
         for outputs in (done[1], again)
@@ -207,7 +204,7 @@ def test_bad_tie_points_are_rejected_and_named_and_change_nothing_else(done, fli
     stamp = messages[middle].stamp_ns
     ties = [Message("observation/tie", stamp, convert.tie_message(f"bad{i}", [f])) for i, (_, f) in enumerate(bad)]
     node = Adjuster(grid_hz=10.0)
-    outputs = run(node, messages[:middle] + ties + messages[middle:])
+    outputs = stepped(node, messages[:middle] + ties + messages[middle:])
     for reason, _ in bad:
         assert node.counters[reason] == 1, reason
     rejected = {(r.point, r.reason) for report in bodies(outputs, "adjustment/report") for r in report.rejected}
@@ -242,7 +239,7 @@ def test_it_waits_for_its_configuration(flight):
     node = Adjuster()
     assert node.state() == "waiting for configuration/project, configuration/camera"
     rest = [x for x in flight[1][:300] if not x.topic.startswith(("configuration/", "observation/control"))]
-    assert run(node, rest) == []
+    assert stepped(node, rest) == []
     assert node.counters["before configuration"] == len(rest)
 
 
@@ -251,7 +248,7 @@ def test_killed_and_restarted_in_flight_it_catches_up(done, flight):
     latched = [x for x in messages if x.topic.startswith("configuration/") or x.topic == "observation/control"]
     again = [x for x in latched if x.stamp_ns < EPOCH + 9e9] + [x for x in messages if x.stamp_ns >= EPOCH + 9e9]
     node = Adjuster(grid_hz=10.0, **SELDOM)
-    outputs = run(node, again)
+    outputs = stepped(node, again)
     final = bodies(outputs, "orientation/final")
     assert seconds(final[0]) < 9.2 and seconds(final[-1]) > 29.8
     error = errors(simulation, [p for p in final if seconds(p) > 12.0])
@@ -269,14 +266,14 @@ def test_invalid_poses_make_invalid_orientation(flight):
             body.valid, body.reason = False, "no GNSS for 3.0 s"
             x = Message(x.topic, x.stamp_ns, body)
         messages.append(x)
-    outputs = run(Adjuster(grid_hz=10.0, **SELDOM), messages)
+    outputs = stepped(Adjuster(grid_hz=10.0, **SELDOM), messages)
     for topic in ("orientation/live", "orientation/final"):
         invalid = [p for p in bodies(outputs, topic) if not p.valid]
         assert 8 <= len(invalid) <= 12 and all(p.reason == "no GNSS for 3.0 s" for p in invalid)
 
 
 def test_an_imported_trajectory_without_filter_output_works_too(flight):
-    outputs = run(Adjuster(grid_hz=10.0, **SELDOM), [x for x in flight[1] if x.topic != "trajectory/filtered"])
+    outputs = stepped(Adjuster(grid_hz=10.0, **SELDOM), [x for x in flight[1] if x.topic != "trajectory/filtered"])
     assert len(bodies(outputs, "orientation/live")) > 250
     assert len(bodies(outputs, "orientation/final")) > 270
 
@@ -285,7 +282,7 @@ def test_an_imported_trajectory_without_filter_output_works_too(flight):
 def test_live_orientation_comes_at_every_time_of_a_coarse_grid(flight, grid_hz):
     simulation, messages = flight
     ((begin, end),) = simulation.flight.strip_times_s
-    outputs = run(Adjuster(grid_hz=grid_hz), [x for x in messages if not x.topic.startswith("observation/")])
+    outputs = stepped(Adjuster(grid_hz=grid_hz), [x for x in messages if not x.topic.startswith("observation/")])
     live = [seconds(p) for p in bodies(outputs, "orientation/live")]
     assert live[0] < begin + 1.0 / grid_hz and live[-1] > end - 1.0 / grid_hz
     assert np.diff(live) == pytest.approx(1.0 / grid_hz, abs=1e-6)
@@ -330,7 +327,7 @@ def test_refused_control_is_in_the_report_and_in_the_log(flight):
 
     # a focal length that is unknown takes a little of 47 m, and Y of a point at the edge of the image is refused, too
     adjuster = Adjuster(grid_hz=2.0, datum="gnss", self_calibration="none", **SELDOM)
-    outputs = run(adjuster, with_control(flight[1], raised))
+    outputs = stepped(adjuster, with_control(flight[1], raised))
     refused = [r for body in bodies(outputs, "adjustment/report") for r in body.rejected if r.coordinate]
     assert refused and {(r.coordinate, r.reason) for r in refused} == {("Z", "contradicts")}
     assert all(r.w > 5.0 and r.off == pytest.approx(47.0, abs=8.0) and not r.ccd for r in refused)
@@ -353,7 +350,7 @@ def test_every_look_that_a_test_refused_has_its_w(flight):
             body.images[0].sample += rng.choice([-1.0, 1.0]) * rng.uniform(10.0, 80.0)
             message = replace(message, body=body)
         messages.append(message)
-    outputs = run(Adjuster(grid_hz=2.0, **SELDOM), messages)
+    outputs = stepped(Adjuster(grid_hz=2.0, **SELDOM), messages)
     rejected = [r for body in bodies(outputs, "adjustment/report") for r in body.rejected if r.reason == "snooping"]
     assert len(rejected) > 20 and all(r.w > 0.0 for r in rejected)
     assert np.median([r.w for r in rejected]) > 5.0
@@ -373,7 +370,7 @@ def test_control_that_comes_or_changes_in_flight_is_told(done, flight):
     del surer.covariance[:]
     surer.covariance.extend([1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 2.5e-3])
     news = [replace(mine[0], stamp_ns=late), *(Message("observation/control", late, b) for b in (changed, surer))]
-    said = [text for text, _ in lines(run(Adjuster(grid_hz=2.0, **SELDOM), rest[:first] + news + rest[first:]))]
+    said = [text for text, _ in lines(stepped(Adjuster(grid_hz=2.0, **SELDOM), rest[:first] + news + rest[first:]))]
     assert f"control came in flight: {mine[0].body.point}" in said
     words = f"{surer.point} in its sigmas, from 0.02, 0.02, 0.02 to 0.01, 0.01, 0.05 m"
     assert f"control changed in flight: {changed.point} by 0.00, 0.00, 0.50 m, {words}" in said
@@ -406,7 +403,7 @@ def test_a_strip_joined_in_its_middle_says_so_and_begins_there(done, flight):
     known = ("configuration/", "observation/control")
     late = [x for x in flight[1] if x.topic.startswith(known) or x.stamp_ns >= joined]
     node = Adjuster(grid_hz=2.0, **SELDOM)
-    outputs = run(node, late)
+    outputs = stepped(node, late)
     said = [text for text, _ in lines(outputs) if "joined" in text]
     assert len(said) == 1 and said[0].startswith("strip S1 is joined 1") and "neither final nor whole" in said[0]
     model = node._window.strips["S1"].model
@@ -431,7 +428,7 @@ def test_another_project_in_flight_starts_the_window_again_and_live_orientation_
             x = replace(x, body=body)
         spoilt.append(x)
     node = Adjuster(grid_hz=10.0, **SELDOM)
-    outputs = run(node, [*spoilt, again, *messages[k:]])
+    outputs = stepped(node, [*spoilt, again, *messages[k:]])
     times = np.array([seconds(p) for p in bodies(outputs, "orientation/live")])
     grid = np.unique(times[np.abs(10 * times - np.round(10 * times)) < 1e-6].round(6))
     assert len(grid) > 0.9 * 280 and np.diff(grid).max() < 1.0

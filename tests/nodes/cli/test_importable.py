@@ -2,7 +2,8 @@
 
 import pytest
 from places import ROOT
-from test_bad_input_commands import main
+
+from triline.nodes.cli import main
 
 POSES = "time_s,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg\n" + "".join(
     f"{1.7e9 + i},{48 + 0.001 * i},11.0,1000,0,0,0\n" for i in range(5)

@@ -8,10 +8,10 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from bus_rig import wait_for
 from recording_file import without_topics
 
 from triline.nodes.cli import batch, main
@@ -55,15 +55,6 @@ def jobs_of(process: subprocess.Popen) -> list[int]:
                 found.append(int(stat.parent.name))
         except OSError:
             continue
-    return found
-
-
-def until(wanted, what: str):
-    """What a question gives as soon as it gives anything."""
-    end = time.monotonic() + 60
-    while not (found := wanted()):
-        assert time.monotonic() < end, what
-        time.sleep(0.02)
     return found
 
 
@@ -219,7 +210,7 @@ def test_a_step_whose_input_failed_is_not_begun(season, capsys):
 
 def test_a_job_that_is_killed_is_done_again(season):
     process = started("season", "-o", "out", *ADJUST)
-    os.kill(until(lambda: jobs_of(process), "no job began")[0], signal.SIGKILL)
+    os.kill(wait_for(lambda: jobs_of(process), 10, "a job")[0], signal.SIGKILL)
     _, told = process.communicate(timeout=120)
     assert process.returncode == 0, told
     attempts = sorted(row["steps"]["adjust"]["attempts"] for row in summary()["flights"])
@@ -230,7 +221,7 @@ def test_one_that_is_always_killed_ends_as_a_failure(season):
     process = started("season/day2/f3.mcap", "-o", "out", *ADJUST, "--retries", "1")
     seen: set[int] = set()
     for _ in range(2):
-        pid = until(lambda: set(jobs_of(process)) - seen, "no job began").pop()
+        pid = wait_for(lambda: set(jobs_of(process)) - seen, 10, "a job").pop()
         seen.add(pid)
         os.kill(pid, signal.SIGKILL)
     _, told = process.communicate(timeout=120)
@@ -242,11 +233,11 @@ def test_one_that_is_always_killed_ends_as_a_failure(season):
 def test_an_interrupted_batch_leaves_what_is_finished_and_nothing_else(season, how):
     """The same command then does the rest; no job works on without its batch."""
     process = started("season", "-o", "out", "--do", "adjust", "--workers", "1")
-    before = until(records, "nothing was finished")
-    jobs = until(lambda: jobs_of(process), "no second job began")
+    before = wait_for(records, 10, "something finished")
+    jobs = wait_for(lambda: jobs_of(process), 10, "a second job")
     process.send_signal(how)
     _, told = process.communicate(timeout=60)
-    until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in jobs), "a job works on")
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in jobs), 10, "the end of a job")
     if how is not signal.SIGKILL:
         assert process.returncode == 1
         assert "interrupted; " in told
@@ -269,7 +260,7 @@ def test_what_was_finished_and_not_looked_at_when_a_batch_is_interrupted_is_fini
 
     def interrupted(plans, pool, *_):
         pool.submit(plans[0].jobs["adjust"], 1, 0)
-        until(lambda: not pool._ended.empty(), "nothing was finished")
+        wait_for(lambda: not pool._ended.empty(), 10, "something finished")
         if taken:
             assert pool.ended(0.0)
         raise KeyboardInterrupt
@@ -282,7 +273,7 @@ def test_what_was_finished_and_not_looked_at_when_a_batch_is_interrupted_is_fini
 
 def test_two_batches_do_not_write_to_one_folder(season, capsys):
     process = started("season", "-o", "out", *ADJUST)
-    until(lambda: jobs_of(process), "no job began")
+    wait_for(lambda: jobs_of(process), 10, "a job")
     assert main(["batch", "season", "-o", "out", *ADJUST]) == 1
     assert "another program" in capsys.readouterr().err
     process.send_signal(signal.SIGINT)

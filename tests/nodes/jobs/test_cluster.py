@@ -9,12 +9,12 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from contextlib import suppress
 from pathlib import Path
 
 import distributed
 import pytest
+from bus_rig import wait_for
 
 from triline.nodes.cli import main
 from triline.nodes.dask_cluster import connect
@@ -36,11 +36,11 @@ class Cluster:
         self.scheduler = self._start(
             "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard"
         )
-        until(self._answers, "the scheduler does not answer")
+        wait_for(self._answers, 15, "an answer of the scheduler")
         words = ("--nthreads", "1", "--no-dashboard", "--local-directory", str(folder / "w"), "--death-timeout", "60")
         self.nanny = self._start("distributed.cli.dask_worker", self.address, *words)
         # a nanny gives up where its worker is killed while it still begins itself
-        until(self._begun, "the worker does not begin")
+        wait_for(self._begun, 15, "the worker")
 
     def _start(self, module: str, *words: str) -> subprocess.Popen:
         with open(self.folder / "cluster.log", "ab") as log:
@@ -64,15 +64,6 @@ class Cluster:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-
-
-def until(wanted, what: str):
-    """What a question gives as soon as it gives anything."""
-    end = time.monotonic() + 90
-    while not (found := wanted()):
-        assert time.monotonic() < end, what
-        time.sleep(0.05)
-    return found
 
 
 def processes(words: str) -> dict[int, int]:
@@ -114,16 +105,16 @@ def test_a_lost_worker_or_scheduler_costs_only_what_it_was_doing(season, cluster
     """The worker is killed during its first job, the scheduler when some jobs are finished."""
     job = f"adjust {season}/"
     program = batch(cluster)
-    (pid, worker), *_ = until(lambda: list(processes(job).items()), "no job began")
+    (pid, worker), *_ = wait_for(lambda: list(processes(job).items()), 15, "a job")
     os.kill(worker, signal.SIGKILL)
-    until(lambda: not Path(f"/proc/{pid}").exists(), "a job works on without its worker")
-    before = until(records, "nothing was finished")
+    wait_for(lambda: not Path(f"/proc/{pid}").exists(), 15, "the end of a job without its worker")
+    before = wait_for(records, 15, "something finished")
     cluster.scheduler.kill()
     _, told = program.communicate(timeout=90)
     if program.returncode:  # it may have been through before it heard of it
         assert re.search("the scheduler is gone; [123] of 3 jobs are finished and kept", told.splitlines()[-1])
     cluster.end()
-    until(lambda: not processes(job), "a job works on without its cluster")
+    wait_for(lambda: not processes(job), 15, "the end of a job without its cluster")
 
     again = Cluster(season)
     try:
@@ -145,12 +136,12 @@ def test_a_lost_worker_or_scheduler_costs_only_what_it_was_doing(season, cluster
 def test_an_interrupted_batch_takes_its_jobs_from_the_cluster(season, cluster):
     job = f"adjust {season}/"
     program = batch(cluster)
-    until(lambda: processes(job), "no job began")
+    wait_for(lambda: processes(job), 15, "a job")
     program.send_signal(signal.SIGINT)
     _, told = program.communicate(timeout=60)
     assert program.returncode == 1
     assert "interrupted; " in told
-    until(lambda: not processes(job), "a job works on that nobody wants")
+    wait_for(lambda: not processes(job), 15, "the end of a job that nobody wants")
 
 
 def test_nobody_at_the_address_is_one_line(season, capsys, monkeypatch):

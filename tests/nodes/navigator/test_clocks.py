@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from stepped_node import stepped
 
 from triline.nodes import convert
 from triline.nodes.navigator.navigator import Navigator
@@ -49,7 +50,7 @@ def shifted(message: Message, seconds: float, stamp: bool = False) -> Message:
 def flown(messages) -> tuple[Navigator, list[str], float]:
     """The node, its event log, and the largest error of valid poses against the flight with a right clock, m."""
     node = Navigator()
-    out = [o for message in messages for o in node.step(message)] + list(node.finish())
+    out = stepped(node, messages)
     events = [o.body.message for o in out if o.topic == "event/log"]
     right = positions(right_poses())
     off = [
@@ -63,7 +64,7 @@ def flown(messages) -> tuple[Navigator, list[str], float]:
 @functools.cache
 def right_poses():
     node = Navigator()
-    out = [o for message in flight() for o in node.step(message)] + list(node.finish())
+    out = stepped(node, flight())
     assert not node.alarm and not [o for o in out if o.topic == "event/log"]
     return tuple(o.body for o in out if o.topic == "trajectory/smoothed")
 
@@ -169,7 +170,7 @@ def turning(imu: bool) -> tuple[Message, ...]:
 def heard(messages, node: Navigator | None = None) -> tuple[Navigator, list[str], list]:
     """The node, its event log and its smoothed poses."""
     node = node or Navigator(filtered_s=1.0, smooth_every_s=4.0)  # answers are rarely wanted here
-    out = [o for message in messages for o in node.step(message)] + list(node.finish())
+    out = stepped(node, messages)
     events = [o.body.message for o in out if o.topic == "event/log"]
     return node, events, [o.body for o in out if o.topic == "trajectory/smoothed"]
 

@@ -10,6 +10,8 @@ import inertial_flights as sim
 import numpy as np
 import pytest
 from bus_rig import ENVIRONMENT, TRILINE, free_port, triline, wait_for
+from recording_file import bodies_of
+from stepped_node import stepped
 
 from triline.nodes import convert
 from triline.nodes.bus.processes import NodeGroup
@@ -54,11 +56,6 @@ def processed(flight: Path) -> Path:
 
 def poses_of(recording: Path, topic: str) -> list:
     return [message.body for message in RecordingReader(recording).sorted_messages([topic])]
-
-
-def bytes_of(recording: Path, topic: str) -> list[tuple[int, bytes]]:
-    messages = RecordingReader(recording).sorted_messages([topic])
-    return [(message.stamp_ns, message.body.SerializeToString(deterministic=True)) for message in messages]
 
 
 def truth_of(recording: Path) -> Trajectory:
@@ -122,17 +119,12 @@ def messages_of(seed: int, grade=TACTICAL, seconds: float = 75.0, **plan: float)
     return [x for x in every if x.topic in Navigator.inputs and x.stamp_ns < end], simulation.flight.truth
 
 
-def run(node: Navigator, messages: list[Message]) -> list[Message]:
-    out = [o for message in messages for o in node.step(message)]
-    return out + list(node.finish())
-
-
 @pytest.mark.study
 def test_errors_are_as_large_as_the_covariance_says_over_seeds():
     mean = {topic: [] for topic in TOPICS}
     for seed in range(1, 5):
         messages, truth = messages_of(seed, MEMS if seed % 2 else TACTICAL)
-        out = run(Navigator(), messages)
+        out = stepped(Navigator(), messages)
         for topic in TOPICS:
             bodies = [o.body for o in out if o.topic == topic][::10]
             mean[topic].append(normalised_squares(bodies, truth, EPOCH).mean(axis=0))
@@ -189,9 +181,9 @@ def test_over_the_bus_it_is_the_same_trajectory_and_a_killed_navigator_aligns_an
         killed.finish()
 
     for topic in TOPICS:
-        live = bytes_of(whole.recording, topic)
+        live = bodies_of(whole.recording, topic)
         assert len(live) > 5000
-        assert live == bytes_of(processed, topic), f"{topic} differs between the bus and `process`"
+        assert live == bodies_of(processed, topic), f"{topic} differs between the bus and `process`"
 
     runs = list(dict.fromkeys(start for start, _, _ in heard))
     assert len(runs) == 2
@@ -243,7 +235,7 @@ def test_a_first_sample_without_usable_noise_means_a_mems_unit(short, changes, s
     messages, truth = short
     node = Navigator(filtered_s=0.1)
     wrong = [damaged(x, **changes) if x.topic == "sensor/imu" else x for x in messages]
-    out = run(node, wrong)
+    out = stepped(node, wrong)
     assert isinstance(node._engine, InertialNavigator) and node._engine.settings.grade.gyro_bias == MEMS.gyro_bias
     assert node.counters["inertial noise"] == (1 if said else 0)  # once, not with every sample
     warnings = [o.body.message for o in out if o.topic == "event/log" and o.body.level == 3]
@@ -269,7 +261,7 @@ def test_bad_samples_are_counted_and_bridged(short, changes, said, filtered_s):
     wrong = list(messages)
     for i in (rows[0], rows[len(rows) // 3], rows[len(rows) // 3 + 1], rows[-200]):
         wrong[i] = damaged(messages[i], **changes)
-    out = run(node, wrong)
+    out = stepped(node, wrong)
     # the first sample of a bag has no interval: nobody knows since when it measured
     counted = 3 if changes == {"interval_ns": 0} else 4
     assert node.counters["malformed"] == counted and said in node.last_problem and "failed" not in node.counters
@@ -280,7 +272,7 @@ def test_samples_without_an_interval_are_counted_but_for_the_first_one(short):
     """A unit that never says how long it measured is not left out without a word."""
     messages = [x for x in short[0] if x.topic == "configuration/project"]
     node, samples = Navigator(), [short[0][i] for i in inertial(short[0])[:20]]
-    run(node, messages + [damaged(x, interval_ns=0) for x in samples])
+    stepped(node, messages + [damaged(x, interval_ns=0) for x in samples])
     assert node.counters["malformed"] == 19 and "interval 0 ns" in node.last_problem
 
 
@@ -290,7 +282,7 @@ def test_duplicates_and_disorder_of_samples_change_nothing(short):
     again = list(messages)
     again.insert(rows[-300], messages[rows[-310]])
     again.insert(rows[500], messages[rows[499]])
-    good, out = run(clean, messages), run(node, again)
+    good, out = stepped(clean, messages), stepped(node, again)
     assert node.counters["inertial out of order"] == 2
     assert [o.body for o in out] == [o.body for o in good]
 
@@ -301,16 +293,16 @@ def test_measured_attitude_beside_inertial_data_is_left_aside_and_counted(short)
     node = Navigator()
     middle = inertial(messages)[100]
     attitude = convert.attitude_message(EPOCH, (0.0, 0.0, 1.0), (1e-4, 1e-4, 1e-4))
-    out = run(node, [*messages[:middle], Message("sensor/attitude", EPOCH, attitude), *messages[middle:]])
+    out = stepped(node, [*messages[:middle], Message("sensor/attitude", EPOCH, attitude), *messages[middle:]])
     assert node.counters["attitude beside inertial data"] == 1
-    assert [o.body for o in out] == [o.body for o in run(Navigator(), messages)]
+    assert [o.body for o in out] == [o.body for o in stepped(Navigator(), messages)]
 
 
 @pytest.mark.study
 def test_an_outage_is_told_once_the_pose_is_too_uncertain_and_ends_with_it():
     messages, truth = messages_of(4, MEMS, 110.0)
     lost = [x for x in messages if not (x.topic == "sensor/gnss" and 40.0 < (x.stamp_ns - EPOCH) / 1e9 < 90.0)]
-    out = run(Navigator(), lost)
+    out = stepped(Navigator(), lost)
     bodies = [o.body for o in out if o.topic == "trajectory/filtered"]
     after = np.array([(convert.time_ns(b.timestamp) - EPOCH) * 1e-9 for b in bodies])
     valid = np.array([b.valid for b in bodies])
@@ -328,7 +320,7 @@ def test_an_outage_is_told_once_the_pose_is_too_uncertain_and_ends_with_it():
 @pytest.mark.study
 def test_slow_gnss_errors_of_many_metres_do_not_make_every_pose_invalid():
     messages, _ = messages_of(5, seconds=40.0, offset_sigma_m=(8.0, 8.0, 12.0))
-    poses = [o.body for o in run(Navigator(), messages) if o.topic == "trajectory/filtered"]
+    poses = [o.body for o in stepped(Navigator(), messages) if o.topic == "trajectory/filtered"]
     assert poses[-1].valid and np.reshape(poses[-1].covariance, (6, 6))[2, 2] > 100.0
 
 

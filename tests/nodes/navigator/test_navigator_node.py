@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from stepped_node import stepped
 
 from triline.nodes import convert
 from triline.nodes.navigator.navigator import Navigator
@@ -23,11 +24,6 @@ EPOCH = 1_700_000_000_000_000_000
 def sensors():
     simulation = simulate(FlightPlan(strip_s=6.0, lead_in_s=3.0, lead_out_s=1.0), 1, ErrorModel(attitude_rate_hz=100.0))
     return [message for message in Simulator(simulation).messages(EPOCH) if message.topic in Navigator.inputs]
-
-
-def run(node, messages):
-    out = [o for message in messages for o in node.step(message)]
-    return out + list(node.finish())
 
 
 def test_every_attitude_message_gives_one_pose_of_each_kind_with_the_stamp_of_its_cause(sensors):
@@ -50,7 +46,7 @@ def test_every_attitude_message_gives_one_pose_of_each_kind_with_the_stamp_of_it
 
 
 def test_poses_are_complete(sensors):
-    poses = [o.body for o in run(Navigator(), sensors) if o.topic == "trajectory/smoothed"]
+    poses = [o.body for o in stepped(Navigator(), sensors) if o.topic == "trajectory/smoothed"]
     sample = convert.pose_sample(poses[500])
     assert sample.covariance is not None and np.linalg.eigvalsh(sample.covariance).min() > 0
     assert sample.valid and poses[500].velocity.x ** 2 + poses[500].velocity.y ** 2 == pytest.approx(4900.0, rel=0.1)
@@ -59,7 +55,7 @@ def test_poses_are_complete(sensors):
 
 def test_same_messages_same_bytes(sensors):
     first, second = (
-        [(o.topic, o.stamp_ns, o.body.SerializeToString(deterministic=True)) for o in run(Navigator(), sensors)]
+        [(o.topic, o.stamp_ns, o.body.SerializeToString(deterministic=True)) for o in stepped(Navigator(), sensors)]
         for _ in range(2)
     )
     assert first == second
@@ -77,7 +73,7 @@ def test_fixes_far_from_the_project_are_told_once(sensors):
         return replace(message, body=body)
 
     node = Navigator()
-    out = run(node, map(exchanged, sensors))
+    out = stepped(node, map(exchanged, sensors))
     (said,) = (o.body for o in out if o.topic == "event/log" and "away from the origin" in o.body.message)
     assert said.message.startswith("GNSS is 5") and said.message.endswith("that of another flight?")
     assert node.alarms["far"] == said.message and node.counters["far from project"] == 1
@@ -125,8 +121,8 @@ def test_bad_values_are_counted_and_dropped_and_the_node_goes_on(sensors, topic,
     clean, node = Navigator(), Navigator()
     middle = len(sensors) // 2
     bad = Message(topic, sensors[middle].stamp_ns, body)
-    good = run(clean, sensors)
-    out = run(node, [*sensors[:middle], bad, *sensors[middle:]])
+    good = stepped(clean, sensors)
+    out = stepped(node, [*sensors[:middle], bad, *sensors[middle:]])
     assert node.counters["malformed"] == 1 and topic in node.last_problem
     assert len(out) == len(good)
     assert out[-1].body == good[-1].body
@@ -135,7 +131,7 @@ def test_bad_values_are_counted_and_dropped_and_the_node_goes_on(sensors, topic,
 def test_without_configuration_it_waits_and_says_so(sensors):
     node = Navigator()
     without = [message for message in sensors if message.topic != "configuration/project"]
-    assert run(node, without) == []
+    assert stepped(node, without) == []
     assert node.state() == "waiting for configuration/project"
     assert node.counters["before configuration"] == len(without)
 
@@ -145,7 +141,7 @@ def test_bad_configuration_is_refused_and_a_good_one_taken_afterwards(sensors):
     bad = m.Project(crs="local", offset_sigma_m=[-1.0, 1.0, 1.0])
     (log,) = node.step(Message("configuration/project", EPOCH, bad))
     assert log.topic == "event/log" and "offset_m" in log.body.message
-    assert len(run(node, sensors)) > 1000
+    assert len(stepped(node, sensors)) > 1000
 
 
 def test_duplicates_disorder_and_an_outage_are_counted(sensors):
@@ -170,9 +166,11 @@ def test_duplicates_disorder_and_an_outage_are_counted(sensors):
 def test_a_restart_in_flight_catches_up(sensors):
     middle = len(sensors) // 2
     latched = [message for message in sensors if message.topic.startswith("configuration/")]
-    out = run(Navigator(), latched + [x for x in sensors[middle:] if not x.topic.startswith("configuration/")])
+    out = stepped(Navigator(), latched + [x for x in sensors[middle:] if not x.topic.startswith("configuration/")])
     whole = {
-        o.body.timestamp.ToNanoseconds(): o.body for o in run(Navigator(), sensors) if o.topic == "trajectory/smoothed"
+        o.body.timestamp.ToNanoseconds(): o.body
+        for o in stepped(Navigator(), sensors)
+        if o.topic == "trajectory/smoothed"
     }
     late = [o.body for o in out if o.topic == "trajectory/smoothed"][-100:]
     assert len(late) == 100

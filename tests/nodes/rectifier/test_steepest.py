@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from stepped_node import stepped
 
 from triline.nodes.cli import main
 from triline.nodes.recording.reader import RecordingReader
@@ -96,7 +97,7 @@ def test_a_lens_is_looked_at_where_poses_come_long_after_its_lines(tmp_path):
             return message.stamp_ns + round(late_s * 1e9) * message.topic.startswith("trajectory/")
 
         used = (message for message in sorted(messages, key=comes_ns) if message.topic.startswith(wanted))
-        return [*(out for message in used for out in rectifier.step(message)), *rectifier.finish()], rectifier
+        return stepped(rectifier, used), rectifier
 
     said, _ = put_out(1.0)
     assert {out.body.ccd for out in said if out.topic == "orthoimage/final"} == {"N"}

@@ -1,13 +1,12 @@
 """The simulator as a node, and the command that writes its recordings."""
 
 import json
-import socket
 import time
 from collections import Counter, defaultdict
 
 import numpy as np
 import pytest
-from bus_rig import wait_for
+from bus_rig import free_port, wait_for
 from places import MOTION
 
 from triline.nodes import convert
@@ -45,13 +44,6 @@ def messages(simulation):
 
 def of(messages, topic):
     return [message for message in messages if message.topic == topic]
-
-
-@pytest.fixture
-def free_port():
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
 
 
 # -- the messages ------------------------------------------------------------------------------------------------------
@@ -363,16 +355,17 @@ def test_settings_reach_the_simulation():
     assert flight.epoch_ns is None and flight.motion is None
 
 
-def test_flight_on_the_bus(free_port):
+def test_flight_on_the_bus():
     """The program publishes what the simulator makes, stamped with the time of the wall, and its status."""
+    port = free_port()
     options = ProgramOptions(
         "simulator",
         platform="sim",
-        port=free_port,
+        port=port,
         tables={"simulator": {"seconds": 1, "lead_in": 1, "ties": 1, "rate": 0}},
     )
     received = []
-    with Bus("sim", source="listener", port=free_port) as bus:
+    with Bus("sim", source="listener", port=port) as bus:
         for topic in (*Simulator.outputs, "status/*"):
             bus.subscribe(topic, received.append)
         before = time.time_ns()
@@ -387,11 +380,12 @@ def test_flight_on_the_bus(free_port):
     assert 0 < min(stamps) - before < 5e9 and stamps == sorted(stamps)
 
 
-def test_program_names_settings_it_does_not_know(free_port):
+def test_program_names_settings_it_does_not_know():
+    port = free_port()
     with pytest.raises(UserError, match="altitude is not known"):
-        run(ProgramOptions("simulator", port=free_port, tables={"simulator": {"altitude": 3}}))
+        run(ProgramOptions("simulator", port=port, tables={"simulator": {"altitude": 3}}))
     with pytest.raises(UserError, match="rate is 'fast'"):
-        run(ProgramOptions("simulator", port=free_port, tables={"simulator": {"rate": "fast"}}))
+        run(ProgramOptions("simulator", port=port, tables={"simulator": {"rate": "fast"}}))
 
 
 def test_missing_output_is_a_usage_error(capsys):
