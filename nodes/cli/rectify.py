@@ -87,6 +87,7 @@ def _only(given: list[Any], what: str = "") -> Any:
 
 def run(args: argparse.Namespace) -> int:
     _refuse_other_formats(args)
+    _refuse_cells_and_ground(args)
     if args.mosaic:
         return rectify_mosaic.run(args)
     args.input = _only(args.input)
@@ -154,6 +155,18 @@ def _refuse_other_formats(args: argparse.Namespace) -> None:
     refuse_other_format(args.stac, "JSON", ".json", ".geojson")
 
 
+def _refuse_cells_and_ground(args: argparse.Namespace) -> None:
+    """Refuse sizes of cells and heights that no input goes with."""
+    for name in ("gsd", "height"):
+        value = getattr(args, name)
+        if value is not None and not np.isfinite(value):
+            raise UserError(f"--{name} {value}: wanted a number")
+    if args.gsd is not None and not args.gsd > 0:
+        raise UserError(f"--gsd {args.gsd}: wanted more than 0")
+    if args.dem and args.height is not None:
+        raise UserError("--height and --dem: wanted one of them")
+
+
 def _check(args: argparse.Namespace) -> None:
     if not args.input.exists():
         raise UserError(f"{args.input}: no such file")
@@ -164,10 +177,6 @@ def _check(args: argparse.Namespace) -> None:
         refuse_unless_writable(path)
     if args.sigma is not None and Path(args.sigma).resolve() == args.output.resolve():
         raise UserError("-o, --sigma: wanted different files")
-    for name in ("gsd", "height"):
-        value = getattr(args, name)
-        if value is not None and not np.isfinite(value):
-            raise UserError(f"--{name} {value}: wanted a number")
     for name in ("pixel_sigma", "height_sigma"):
         value = getattr(args, name)
         option = flag(name)
@@ -175,14 +184,10 @@ def _check(args: argparse.Namespace) -> None:
             raise UserError(f"{option} {value}: wanted a number of at least 0")
         if value is not None and args.sigma is None:
             raise UserError(f"{option}: goes with --sigma FILE, for which it counts")
-    if args.gsd is not None and not args.gsd > 0:
-        raise UserError(f"--gsd {args.gsd}: wanted more than 0")
     if args.trajectory is not None and args.orientation is not None:
         raise UserError("--orientation and --trajectory: wanted one of them")
     if args.dem_crs is not None and args.dem in (None, ["points"]):
         raise UserError(f"--dem-crs {args.dem_crs}: is of a raster of heights, wanted --dem FILE with it")
-    if args.dem is not None and args.height is not None:
-        raise UserError("--height and --dem: wanted one of them")
     rectify_image.refuse_occlusions_of_level_ground(args)
     rectify_image.refuse_empty_bounds(args)
     if args.dem is not None and len(args.dem) > 1:

@@ -200,12 +200,6 @@ def _check(args: argparse.Namespace) -> None:
     for name in ("orientation", "trajectory", "camera", "ccd", "strip"):
         if name != "ccd" and getattr(args, name):
             raise UserError(f"--{name}: goes with a recording, not with --sensor")
-    if args.gsd is not None and not (np.isfinite(args.gsd) and args.gsd > 0):
-        raise UserError(f"--gsd {args.gsd}: wanted more than 0")
-    if args.height is not None and not np.isfinite(args.height):
-        raise UserError(f"--height {args.height}: wanted a number")
-    if args.dem and args.height is not None:
-        raise UserError("--height and --dem: wanted one of them")
     refuse_occlusions_of_level_ground(args)
     if args.correction is not None and args.control is None:
         raise UserError(f"--correction {args.correction}: goes with --control CSV, whose points it is found by")

@@ -194,10 +194,6 @@ def _check(args: argparse.Namespace, outputs: Outputs) -> None:
         raise UserError(f"--feather {args.feather}: wanted 0 to {tile // 4} cells")
     if args.workers is not None and args.workers < 1:
         raise UserError(f"--workers {args.workers}: wanted at least 1")
-    if args.gsd is not None and not 0 < args.gsd < float("inf"):
-        raise UserError(f"--gsd {args.gsd}: wanted more than 0")
-    if args.dem and args.height is not None:
-        raise UserError("--height and --dem: wanted one of them")
 
 
 def _kinds(args: argparse.Namespace) -> list[tuple[str, Path, str | None]]:

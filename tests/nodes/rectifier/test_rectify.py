@@ -503,6 +503,8 @@ def test_refraction_moves_an_orthoimage_by_as_much_as_the_air_does(flown, folder
         (["--dem", __file__], "not a raster"),
         (["--height", "9000"], "below the ground"),
         (["--height", "1", "--dem", "points"], "wanted one of them"),
+        (["--mosaic", "--height", "nan"], "--height nan: wanted a number"),
+        (["--mosaic", "--gsd", "inf"], "--gsd inf: wanted a number"),
         (["--crs", "+proj=gnom +lat_0=-49 +lon_0=-170 +datum=WGS84 +type=crs"], "lies outside its area"),
     ],
 )
