@@ -67,6 +67,7 @@ from ..recording.summary import OF_RECORDING, damage_lines, in_brackets, left_ou
 from ..terminal import drawing, plain, redraws, width
 from ..voices import RecordedVoices
 from .adjust_scenes import run_scenes
+from .common_options import refuse_less
 from .dem_options import add_dem_options, dem_settings
 from .location_options import refraction_of
 from .navigated import navigated
@@ -201,10 +202,8 @@ def _refuse_options(args: argparse.Namespace) -> dict[str, Any]:
     dem = dem_settings(args)
     if not args.critical > 0:
         raise UserError(f"--critical {args.critical:g}, wanted more than 0")
-    for option, least in (("iterations", 1), ("segments", 1), ("fixes", FEWEST_FIXES)):
-        number = getattr(args, option)
-        if number is not None and number < least:
-            raise UserError(f"--{option} {number}, wanted {least} at least")
+    refuse_less(args, 1, "iterations", "segments")
+    refuse_less(args, FEWEST_FIXES, "fixes")
     if args.output:
         refuse_unless_folder(Path(args.output))
         refuse_folder_of_inputs(Path(args.output))
@@ -322,12 +321,10 @@ def read_input(path: Path) -> BlockData:
 
 def refuse_worker_options(args: argparse.Namespace) -> None:
     """Raise UserError for numbers of workers and rays, and for options, that do not go."""
-    if args.workers is not None and args.workers < 1:
-        raise UserError(f"--workers {args.workers}, wanted 1 at least")
+    refuse_less(args, 1, "workers")
     if args.workers is not None and args.scheduler:
         raise UserError("--workers and --scheduler: wanted one of them")
-    if args.partition_rays is not None and args.partition_rays < LEAST_RAYS:
-        raise UserError(f"--partition-rays {args.partition_rays}, wanted {LEAST_RAYS} at least")
+    refuse_less(args, LEAST_RAYS, "partition_rays")
     for option, value in (("--scratch", args.scratch), ("--partition-rays", args.partition_rays)):
         if value is not None and not (args.workers or args.scheduler):
             raise UserError(f"{option} goes with --workers or --scheduler")

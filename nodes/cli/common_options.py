@@ -1,8 +1,10 @@
-"""Options that every command takes."""
+"""Options that every command takes, and checks that several make."""
 
 from __future__ import annotations
 
 import argparse
+
+from ..errors import UserError, flag
 
 _OPTIONS = (
     (("--json",), "print a machine-readable result"),
@@ -17,3 +19,12 @@ def add_common(parser: argparse.ArgumentParser, *, again: bool = False) -> None:
     default = argparse.SUPPRESS if again else False
     for words, text in _OPTIONS:
         parser.add_argument(*words, action="store_true", default=default, help=text)
+
+
+def refuse_less(args: argparse.Namespace, least: int, *names: str) -> None:
+    """Raise UserError where an option (as attribute), or one of its several numbers, is less than the least one."""
+    for name in names:
+        numbers = getattr(args, name)
+        for number in numbers if isinstance(numbers, list) else [numbers]:
+            if number is not None and number < least:
+                raise UserError(f"{flag(name)} {number}, wanted {least} at least")

@@ -6,8 +6,8 @@ import argparse
 import math
 
 from ...solver.simulation.consistency import MODELS, Consistency, consistency
-from ..errors import UserError
 from ..formats.json_text import json_text
+from .common_options import refuse_less
 from .progress import progress
 
 EXAMPLE = "triline study consistency --seeds 200"
@@ -18,8 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.seeds < 1:
-        raise UserError(f"--seeds {args.seeds}, wanted 1 at least")
+    refuse_less(args, 1, "seeds")
     cases = [(name, calibrated) for name in MODELS for calibrated in (False, True)]
     found: dict[str, Consistency] = {}
     for name, calibrated in cases:

@@ -26,6 +26,7 @@ from ..formats.scene_block import is_scene_block, read_scene_block
 from ..formats.table import write_table
 from ..worker_pool import cores
 from .adjust import read_input
+from .common_options import refuse_less
 from .control_runs import (
     AirborneBlock,
     Axes,
@@ -96,11 +97,7 @@ def run(args: argparse.Namespace) -> int:
             refuse_unless_writable(path)
     if args.plot:
         refuse_unless_picture(args.plot)
-    for option in ("segments", "fixes", "iterations", "jobs"):
-        values = getattr(args, option)
-        for value in values if isinstance(values, list) else [values]:
-            if value is not None and value < 1:
-                raise UserError(f"--{option} {value}, wanted 1 at least")
+    refuse_less(args, 1, "segments", "fixes", "iterations", "jobs")
     if args.control_sigma is not None and not 0 < args.control_sigma < float("inf"):
         raise UserError(f"--control-sigma {args.control_sigma:g}, wanted more than 0")
     path = Path(args.block)

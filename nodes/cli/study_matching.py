@@ -11,13 +11,13 @@ import numpy as np
 
 from ...solver.simulation.flight import Flight
 from ..adjuster.adjuster import Adjuster
-from ..errors import UserError
 from ..formats.json_text import json_text
 from ..matcher.matcher import Matcher
 from ..navigator.navigator import Navigator
 from ..recording.reader import RecordingReader
 from ..simulator.flight_settings import simulated_flight
 from ..simulator.simulator import Simulator
+from .common_options import refuse_less
 from .matched_ties import ROUGH, is_matched, tie_errors
 from .study_flights import EPOCH_NS, each, processed
 
@@ -42,8 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.seeds < 1:
-        raise UserError(f"--seeds {args.seeds}, wanted 1 at least")
+    refuse_less(args, 1, "seeds")
     base = {"sensor": "ads40-small", "pixels": args.pixels, "seconds": args.seconds, "lead_in": 2.0, "images": True}
     kinds = ["plain"] if args.plain else list(KINDS)
     cases = [(kind, args.first + i) for kind in kinds for i in range(args.seeds)]

@@ -11,7 +11,6 @@ import numpy as np
 
 from ...solver.accuracy import nees_band, normalised_error_squared
 from ..adjuster.adjuster import Adjuster
-from ..errors import UserError
 from ..formats.json_text import json_text
 from ..navigator.navigator import Navigator
 from ..report.evaluation import evaluate_flight, orientation_errors
@@ -19,6 +18,7 @@ from ..report.flight import collect
 from ..report.source import messages_of
 from ..simulator.flight_settings import simulated_flight
 from ..simulator.simulator import Simulator
+from .common_options import refuse_less
 from .study_flights import EPOCH_NS, each, processed
 
 EXAMPLE = "triline study online --seeds 20"
@@ -32,8 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.seeds < 2:
-        raise UserError(f"--seeds {args.seeds}, wanted 2 at least")
+    refuse_less(args, 2, "seeds")
     settings = {"seconds": args.seconds, "unstabilised": args.unstabilised}
     cases = [{**settings, "seed": seed} for seed in range(args.seeds)]
     result = summary(list(each(fly, cases, args.quiet or args.json)))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 
 from ...solver.simulation.scene_study import CONFIGURATIONS, SENSORS, ErrorRatio, error_over_sigma
-from ..errors import UserError
 from ..formats.json_text import json_text
+from .common_options import refuse_less
 from .progress import progress
 
 EXAMPLE = "triline study scenes --seeds 50"
@@ -20,8 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.seeds < 1:
-        raise UserError(f"--seeds {args.seeds}, wanted 1 at least")
+    refuse_less(args, 1, "seeds")
     found: dict[tuple[str, str, str], ErrorRatio] = {}
     sensors = SENSORS if args.sensor is None else (args.sensor,)
     for sensor in sensors:

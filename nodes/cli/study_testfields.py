@@ -14,6 +14,7 @@ from ...solver.simulation.testfield_study import Row, study
 from ...solver.simulation.testfields import TESTFIELDS, Published
 from ..errors import UserError
 from ..formats.json_text import json_text
+from .common_options import refuse_less
 from .progress import progress
 
 EXAMPLE = "triline study testfields --seeds 10 --only pavia2000 zurich"
@@ -37,8 +38,7 @@ def run(args: argparse.Namespace) -> int:
     unknown = [name for name in args.only if name not in NETWORKS]
     if unknown:
         raise UserError(f"--only {unknown[0]}: no such testfield, wanted {', '.join(NETWORKS)}")
-    if args.seeds < 1:
-        raise UserError(f"--seeds {args.seeds}, wanted 1 at least")
+    refuse_less(args, 1, "seeds")
     networks = tuple(make() for name, make in NETWORKS.items() if not args.only or name in args.only)
     with progress("sigmas", args.quiet or args.json) as tell:
         promised = network_sigmas(networks, args.seeds, tell)
