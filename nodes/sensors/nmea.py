@@ -20,6 +20,7 @@ import numpy as np
 from pynmeagps import GET, VALCKSUM, NMEAReader
 
 from ..convert import SECOND_NS, attitude_message, check_place, gnss_message
+from ..formats.gps_time import WEEK_ROLLOVER
 from ..formats.keys import Keys
 from ..node import Message
 from ..ordering import REBASE_AFTER
@@ -105,6 +106,7 @@ class NmeaParser:
         self._quality = self._stated_quality = 0  # of the newest GGA, and of the one a GST is about
         self._motion: tuple[int, tuple[float, float]] | None = None  # east and north velocity, of an RMC
         self._few_told = False  # that fixes are rounded
+        self._era_told = False  # that weeks count modulo 1024
 
     def feed(self, data: bytes) -> list[Message]:
         """The messages that follow from more bytes."""
@@ -144,10 +146,10 @@ class NmeaParser:
     # ---- sentences
 
     def _rmc(self, s: Any) -> list[Message]:
-        if isinstance(s.date, date):
-            self._newest = _at(s.date, s.time)
-        if s.status != "A":
+        if s.status != "A":  # nor is the date to be believed: that of a receiver without a fix begins in 1980
             return []
+        if isinstance(s.date, date):
+            self._newest = _at(self._in_this_era(s.date), s.time)
         utc_ns = self._utc(s.time)
         if utc_ns is not None:
             self._epoch_ns = utc_ns
@@ -159,7 +161,7 @@ class NmeaParser:
         return []
 
     def _zda(self, s: Any) -> list[Message]:
-        self._newest = _at(date(int(s.year), int(s.month), int(s.day)), s.time)
+        self._newest = _at(self._in_this_era(date(int(s.year), int(s.month), int(s.day))), s.time)
         return []
 
     def _gst(self, s: Any) -> list[Message]:
@@ -207,6 +209,18 @@ class NmeaParser:
         return [Message("sensor/attitude", settings.clock.stamp(self._epoch_ns), body)]
 
     # ---- time and accuracy
+
+    def _in_this_era(self, said: date) -> date:
+        """The day that a sentence says, of a receiver that counts weeks modulo 1024 that of the settings' era."""
+        era = timedelta(weeks=WEEK_ROLLOVER)
+        turns = 0 if self._settings.day is None else round((self._settings.day - said) / era)
+        day = said + turns * era
+        if not turns or self._settings.day is None or abs((self._settings.day - day).days) > 1:
+            return said
+        if not self._era_told:
+            self._era_told = True
+            self._problem("wrong weeks", f"the receiver says {said}, {turns * WEEK_ROLLOVER} weeks off: {day} taken")
+        return day
 
     def _utc(self, time: time_of_day) -> int | None:
         """UTC in ns of a time of day, on the day that brings it next to the newest time; None before a day is known."""

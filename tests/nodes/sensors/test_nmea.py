@@ -6,7 +6,7 @@ import os
 import socket
 import threading
 from collections import Counter
-from datetime import date
+from datetime import UTC, date, datetime
 from pathlib import Path
 
 import numpy as np
@@ -173,7 +173,7 @@ def test_what_cannot_be_used_is_counted_and_the_next_fix_comes(tmp_path, data, k
     "wrong",
     [
         gga("102751.00"),  # an hour ahead
-        sentence("GNRMC,092751.00,V,,,,,,,010140,,,N") + gga("092751.00") + RMC,  # before the receiver has a date
+        sentence("GNRMC,092751.00,A,5321.68,N,00630.34,W,0,0,010140,,,A") + gga("092751.00") + RMC,
         sentence("GNZDA,092751.00,22,11,2027,00,00") + gga("092751.00") + RMC,
     ],
 )
@@ -192,6 +192,25 @@ def test_one_wrong_time_does_not_silence_all_fixes_that_follow(tmp_path, wrong):
 def test_without_a_date_there_is_no_time(tmp_path):
     messages, counts = parse(tmp_path, gga("092750.20") + RMC + gga("092750.40"))
     assert len(messages) == 1 and counts == {"no date yet": 1}
+
+
+def test_the_date_of_a_receiver_without_a_fix_is_not_believed(tmp_path):
+    """As a real one wrote them: its first fix went out with a day in 1980."""
+    before = sentence("GPRMC,235952.953,V,0000.0000,N,00000.0000,E,,0.00,050180,,,N")
+    first = sentence("GPGGA,102523.342,4815.6883,N,01140.3675,E,1,03,4.1,-47.5,M,47.5,M,,0000")
+    dated = sentence("GPRMC,102523.342,A,4815.6883,N,01140.3675,E,0.00,0.00,210808,,,A")
+    then = sentence("GPGGA,102524.342,4815.6880,N,01140.3673,E,1,03,4.1,-47.5,M,47.5,M,,0000")
+    (message,), counts = parse(tmp_path, before + first + dated + then)
+    assert counts == {"no date yet": 1}
+    assert datetime.fromtimestamp(message.stamp_ns * 1e-9, UTC).date() == date(2008, 8, 21)
+
+
+def test_the_day_of_the_flight_tells_weeks_modulo_1024(tmp_path):
+    late = sentence("GNRMC,092750.00,A,5321.6802,N,00630.3372,W,120.00,090.00,080407,,,A")  # 1024 weeks before T0
+    (message,), counts = parse(tmp_path, late + late + gga("092750.20"), date=date(2026, 11, 22))
+    assert message.stamp_ns == T0 + 200_000_000 and counts == {"wrong weeks": 1}
+    (message,), counts = parse(tmp_path, RMC + gga("092750.20"), date=date(2026, 5, 1))
+    assert message.stamp_ns == T0 + 200_000_000 and not counts  # another day: that of the receiver
 
 
 def test_an_rmc_that_comes_too_late_for_its_velocity_is_counted(tmp_path):
