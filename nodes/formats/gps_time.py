@@ -29,13 +29,18 @@ def gps_week(day: date) -> tuple[int, int]:
 
 def utc_ns_from_gps(week: int, seconds_of_week: ArrayLike) -> NDArray[np.int64]:
     """UTC as integer nanoseconds since the Unix epoch, (n,), of a GPS week and seconds in it (n,)."""
-    seconds = np.asarray(seconds_of_week, dtype=float)
-    start_s = GPS_EPOCH_S + week * WEEK_S
-    whole = np.floor(seconds)
-    gps_s = start_s + whole.astype(np.int64)
+    ns = utc_ns_from_utc(week, seconds_of_week)
     # a leap second counts from the GPS second at which UTC has already fallen behind
-    ahead = np.searchsorted(_LEAP_S + np.arange(1, len(_LEAP_S) + 1), gps_s, side="right")
-    return (gps_s - ahead) * 1_000_000_000 + np.rint((seconds - whole) * 1e9).astype(np.int64)
+    ahead = np.searchsorted(_LEAP_S + np.arange(1, len(_LEAP_S) + 1), ns // 1_000_000_000, side="right")
+    return ns - ahead * 1_000_000_000
+
+
+def utc_ns_from_utc(week: int, seconds_of_week: ArrayLike) -> NDArray[np.int64]:
+    """UTC as integer nanoseconds since the Unix epoch, (n,), of a week and seconds in it (n,) that count in UTC."""
+    seconds = np.asarray(seconds_of_week, dtype=float)
+    whole = np.floor(seconds)
+    start_s = GPS_EPOCH_S + week * WEEK_S
+    return (start_s + whole.astype(np.int64)) * 1_000_000_000 + np.rint((seconds - whole) * 1e9).astype(np.int64)
 
 
 def gps_from_utc_ns(utc_ns: ArrayLike) -> tuple[int, NDArray[np.float64]]:

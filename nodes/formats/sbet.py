@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from datetime import date, timedelta
 from pathlib import Path
 
@@ -38,9 +39,10 @@ def read_sbet(
 ) -> NavigationTrack:
     """Poses of an SBET file. True heading is the platform heading less the wander angle.
 
-    Times are GPS seconds of the week, or of the day: ``seconds_of_day`` says which; None takes them as seconds of the
-    day where all are below one day and ``day`` is not a Sunday or Monday. ``accuracies`` is the SMRMSG file with the
-    accuracies of the poses; None takes the one beside the file under its name, if there is one.
+    Times are GPS seconds, or of UTC where the name of the file has ``UTC`` or ``UTCtime`` as a word, of the week or
+    of the day: ``seconds_of_day`` says which; None takes them as seconds of the day where all are below one day and
+    ``day`` is not a Sunday or Monday. ``accuracies`` is the SMRMSG file with the accuracies of the poses; None takes
+    the one beside the file under its name, if there is one.
 
     Raises
     ------
@@ -63,7 +65,10 @@ def read_sbet(
             notes.append(
                 f"{path.name}: times below one day, {what}; if they count from midnight, wanted --seconds-of-day"
             )
-    time = times_from_gps(path, column["time"], day, notes, of_day=of_day)
+    utc = re.search(r"(?<![a-z])utc(time)?(?![a-z])", path.stem, re.IGNORECASE) is not None
+    if utc:
+        notes.append(f"{path.name}: times are taken as seconds of UTC, as its name says")
+    time = times_from_gps(path, column["time"], day, notes, of_day=of_day, utc=utc)
     with np.errstate(over="ignore"):  # a damaged file overflows here and is refused below
         lat_lon = np.degrees(np.column_stack([column["lat"], column["lon"]]))
     heading = column["platform_heading"] - column["wander_angle"]

@@ -50,10 +50,13 @@ def is_smrmsg(path: Path) -> bool:
 
 
 def beside(sbet: Path) -> Path | None:
-    """The SMRMSG in the folder of an SBET under its name (``sbet_7.out`` and ``smrmsg_7.out``), if there is one."""
+    """The SMRMSG in the folder of an SBET under its name, if there is one.
+
+    That of ``sbet_7.out`` is ``smrmsg_7.out`` or ``sbet_7-smrmsg.out``.
+    """
     name = re.sub("sbet", lambda said: "SMRMSG" if said[0].isupper() else "smrmsg", sbet.name, flags=re.IGNORECASE)
-    path = sbet.with_name(name)
-    return path if name != sbet.name and path.is_file() else None
+    names = (name, f"{sbet.stem}-smrmsg{sbet.suffix}", f"{sbet.stem}_smrmsg{sbet.suffix}")
+    return next((path for path in map(sbet.with_name, names) if path != sbet and path.is_file()), None)
 
 
 def read_smrmsg(path: Path, seconds: Array) -> PoseAccuracies:

@@ -27,7 +27,7 @@ from ...solver.models.dgr import DgrOptions
 from ..convert import pose_message
 from ..errors import UserError
 from ..node import Message
-from .gps_time import DAY_S, WEEK_S, gps_week, unwrap_weeks, utc_ns_from_gps
+from .gps_time import DAY_S, WEEK_S, gps_week, unwrap_weeks, utc_ns_from_gps, utc_ns_from_utc
 
 Array = NDArray[np.floating]
 
@@ -164,10 +164,10 @@ def checked(track: NavigationTrack, path: Path, rows: NDArray[np.intp] | None = 
     rising = np.concatenate([[True], track.time_ns[1:] > newest[:-1]])
     if rising.sum() < 2:
         raise UserError(f"{path}: {int(rising.sum())} poses with rising time, wanted at least 2")
-    if rising.all():
-        return _with_jumps(track, path, number)
-    note = f"{path.name}: {int((~rising).sum())} poses do not come after the one before them and were left out"
-    return _with_jumps(_part(track, rising, note), path, number[rising])
+    if not rising.all():
+        note = f"{path.name}: {int((~rising).sum())} poses do not come after the one before them and were left out"
+        track, number = _part(track, rising, note), number[rising]
+    return _with_jumps(track, path, number)
 
 
 def _part(track: NavigationTrack, which: NDArray[np.bool_], note: str) -> NavigationTrack:
@@ -201,11 +201,11 @@ def _with_jumps(track: NavigationTrack, path: Path, number: NDArray[np.intp]) ->
 
 
 def times_from_gps(
-    path: Path, seconds: Array, day: date | None, notes: list[str], *, of_day: bool = False
+    path: Path, seconds: Array, day: date | None, notes: list[str], *, of_day: bool = False, utc: bool = False
 ) -> NDArray[np.int64]:
     """UTC nanoseconds of GPS seconds of the week (or of the day), given the day of the flight.
 
-    Without a day the times count from the start of GPS time, and a note says so.
+    Without a day the times count from the start of GPS time, and a note says so. With ``utc`` the seconds are of UTC.
 
     Raises
     ------
@@ -215,14 +215,15 @@ def times_from_gps(
     if len(bad):
         what = f"{seconds[bad[0]]:.6g}, wanted GPS seconds of the week, 0 to {WEEK_S}"
         raise UserError(f"{path}: record {bad[0] + 1}: time: {what}")
+    ns_of = utc_ns_from_utc if utc else utc_ns_from_gps
     seconds = unwrap_weeks(seconds, DAY_S if of_day else WEEK_S)
     if day is None:
         notes.append(f"{path.name}: the day of the flight is not known (--date); times count from 1980-01-06")
-        return utc_ns_from_gps(0, seconds)
+        return ns_of(0, seconds)
     week, weekday = gps_week(day)
     seconds = seconds - seconds[0] // WEEK_S * WEEK_S  # of a flight over the end of a week that was cut behind it
     if of_day:
-        return utc_ns_from_gps(week, seconds + weekday * DAY_S)
+        return ns_of(week, seconds + weekday * DAY_S)
     said = int(seconds[0] // DAY_S) % 7
     apart = (said - weekday + 3) % 7 - 3  # UTC and GPS days, and flights over midnight, may differ by one
     if abs(apart) > 1:
@@ -230,7 +231,7 @@ def times_from_gps(
         raise UserError(f"{path}: GPS seconds of the week say {names[said]}, but {day} is a {names[weekday]}")
     if apart and abs(said - weekday) > 1:  # the week begins or ends between the two
         week += 1 if said < weekday else -1
-    return utc_ns_from_gps(week, seconds)
+    return ns_of(week, seconds)
 
 
 def frame_of(track: NavigationTrack) -> LocalFrame:

@@ -460,6 +460,27 @@ def test_sbet_over_the_end_of_a_week(tmp_path):
         assert read_sbet(path, date(2020, 6, day)).time_ns[0] == track.time_ns[2]
 
 
+@pytest.mark.parametrize(
+    ("name", "behind_s"),
+    [
+        ("sbet--UTCtime-Lillehammer_211021.out", 0),
+        ("Lillehammer-WGS84-UTC-10Hz.out", 0),
+        ("sbet_utc.out", 0),
+        ("sbet_butcher.out", 18),
+    ],
+)
+def test_sbet_in_seconds_of_utc_by_its_name(tmp_path, name, behind_s):
+    """As TerraPos names them, which writes such ones."""
+    path = tmp_path / name
+    values = np.zeros((3, 17))
+    values[:, 0] = [604799.0, 604799.5, 0.0]
+    values[:, 1:4] = [0.8, 0.2, 1000.0]
+    values.tofile(path)
+    track = read_sbet(path, date(2020, 6, 6))
+    assert track.time_ns.tolist() == [ns("2020-06-06T23:59:59") - behind_s * 10**9 + k * 500_000_000 for k in range(3)]
+    assert any("as its name says" in note for note in track.notes) == (behind_s == 0)
+
+
 def test_sbet_damaged(tmp_path):
     path = tmp_path / "sbet.out"
     track = straight_track()

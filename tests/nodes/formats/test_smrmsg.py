@@ -40,6 +40,14 @@ def test_records_are_what_other_programs_read(tmp_path):
     )
 
 
+@pytest.mark.parametrize("name", ["sbet_x-smrmsg.out", "sbet_x_smrmsg.out"])
+def test_accuracies_beside_an_sbet_may_be_named_behind_it(tmp_path, name):
+    """As TerraPos names them."""
+    sbet = write_sbet_file(tmp_path)
+    write_accuracies(tmp_path / name, SECONDS[[0, -1]])
+    assert f"sbet_x.out: accuracies of the poses are those of {name}" in read_sbet(sbet, DAY).notes
+
+
 def test_accuracies_beside_an_sbet_are_interpolated(tmp_path):
     sbet = write_sbet_file(tmp_path)
     assert not read_sbet(sbet, DAY).has_accuracies
