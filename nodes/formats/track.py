@@ -27,6 +27,7 @@ from ...solver.models.dgr import DgrOptions
 from ..convert import pose_message
 from ..errors import UserError
 from ..node import Message
+from .course import attitude_remarks
 from .gps_time import DAY_S, WEEK_S, gps_week, unwrap_weeks, utc_ns_from_gps, utc_ns_from_utc
 
 Array = NDArray[np.floating]
@@ -167,7 +168,8 @@ def checked(track: NavigationTrack, path: Path, rows: NDArray[np.intp] | None = 
     if not rising.all():
         note = f"{path.name}: {int((~rising).sum())} poses do not come after the one before them and were left out"
         track, number = _part(track, rising, note), number[rising]
-    return _with_jumps(track, path, number)
+    remarks = (f"{path.name}: {remark}" for remark in attitude_remarks(track.time_ns, track.geodetic, track.rpy))
+    return _with_jumps(replace(track, notes=(*track.notes, *remarks)), path, number)
 
 
 def _part(track: NavigationTrack, which: NDArray[np.bool_], note: str) -> NavigationTrack:

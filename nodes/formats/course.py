@@ -1,0 +1,80 @@
+"""Whether attitudes go with the flight that positions say: heading with the course, roll with the turns."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...solver.geometry.earth import SEMI_MAJOR_M
+
+Array = NDArray[np.floating]
+
+#: Steps over which the course is taken, s; those behind a gap do not count.
+_STEP_S, _GAP_S = 1.0, 5.0
+#: Aircraft that are slower may fly sideways, m/s.
+_SLOW_M_S = 10.0
+#: No crab angle is larger, degrees, and turns are those with a bank of at least and at most so much, degrees.
+_MOST_CRAB_DEG = 35.0
+_BANKS_DEG = (8.0, 60.0)
+#: So many steps have to say something.
+_FEWEST = 10
+#: Other conventions -> the heading by them, of the one that stands in the file.
+_CONVENTIONS = {
+    "counted counter-clockwise": lambda heading: -heading,
+    "of the opposite direction": lambda heading: heading + np.pi,
+    "counted from east, counter-clockwise": lambda heading: np.pi / 2 - heading,
+    "counted from east, clockwise": lambda heading: np.pi / 2 + heading,
+    "counted from west, clockwise": lambda heading: heading - np.pi / 2,
+}
+
+
+def attitude_remarks(time_ns: NDArray[np.int64], geodetic: Array, rpy: Array) -> list[str]:
+    """Remarks about headings and rolls of another convention than that of `solver`; none where nothing tells.
+
+    Parameters
+    ----------
+    time_ns : (n,), rising
+    geodetic : (n, 3) latitude and longitude in degrees, height in metres
+    rpy : (n, 3) roll, pitch, heading, radians
+    """
+    step = max(round(_STEP_S * 1e9 / float(np.median(np.diff(time_ns)))), 1)
+    apart_s = np.diff(time_ns[::step]) * 1e-9
+    lat, lon = np.radians(geodetic[::step, :2].T)
+    north = np.diff(lat) * SEMI_MAJOR_M
+    east = _wrapped(np.diff(lon)) * SEMI_MAJOR_M * np.cos(lat[:-1])
+    speed = np.hypot(north, east) / apart_s
+    counts = (speed > _SLOW_M_S) & (apart_s < _GAP_S)
+    course, heading, roll = np.arctan2(east, north), rpy[::step, 2][:-1], rpy[::step, 0]
+    remarks = []
+    if counts.sum() >= _FEWEST:
+        remarks += _of_heading(heading[counts], course[counts])
+    both = counts[:-1] & counts[1:]
+    if both.any():
+        rate = _wrapped(np.diff(course))[both] / (0.5 * (apart_s[:-1] + apart_s[1:]))[both]
+        remarks += _of_roll(roll[1:-1][both], np.arctan(speed[1:][both] * rate / 9.81))
+    return remarks
+
+
+def _wrapped(angle: Array) -> Array:
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _of_heading(heading: Array, course: Array) -> list[str]:
+    def share(said: Array) -> float:
+        return float(np.mean(np.abs(_wrapped(said - course)) < np.radians(_MOST_CRAB_DEG)))
+
+    if share(heading) > 0.2:
+        return []
+    off_deg = np.degrees(np.median(np.abs(_wrapped(heading - course))))
+    fit = [name for name, by in _CONVENTIONS.items() if share(by(heading)) > 0.8]
+    maybe = f" (are they {' or '.join(fit)}?)" if fit else ""
+    return [f"headings are {off_deg:.0f} deg off the course (median), wanted from north, clockwise{maybe}"]
+
+
+def _of_roll(roll: Array, bank: Array) -> list[str]:
+    """``bank`` (n,) is the roll that holds an aircraft in the turns which it flies."""
+    least, most = np.radians(_BANKS_DEG)
+    turns = (np.abs(bank) > least) & (np.abs(bank) < most)
+    if turns.sum() < _FEWEST or roll[turns] @ bank[turns] > -0.5 * (bank[turns] @ bank[turns]):
+        return []
+    return ["the flight turns left where the roll is to the right: wanted positive with the right wing down"]
