@@ -152,7 +152,8 @@ def _lat_lon(
     if "LATITUDE" in column and "LONGITUDE" in column:
         lat, lon = column["LATITUDE"], column["LONGITUDE"]
         if mapped is not None:
-            apart = 111_000 * float(np.hypot((mapped[0] - lon) * np.cos(np.radians(lat)), mapped[1] - lat).max())
+            east = (mapped[0] - lon + 180.0) % 360.0 - 180.0
+            apart = 111_000 * float(np.hypot(east * np.cos(np.radians(lat)), mapped[1] - lat).max())
             if apart > 0.01:
                 notes.append(f"{path.name}: mapping frame and latitude/longitude differ by up to {apart:.2f} m")
         return lat, lon

@@ -22,6 +22,8 @@ FIELDS = (
     *("x_acceleration", "y_acceleration", "z_acceleration", "x_rate", "y_rate", "z_rate"),
 )
 RECORD = 8 * len(FIELDS)
+#: Datums off WGS 84 that programs put into the name of an SBET, which has no place for one.
+_DATUMS = "NAD27|NAD83|ETRS89|GDA94|GDA2020|JGD2011|CSRS|ED50|SIRGAS"
 
 
 def is_sbet(path: Path) -> bool:
@@ -68,6 +70,8 @@ def read_sbet(
     utc = re.search(r"(?<![a-z])utc(time)?(?![a-z])", path.stem, re.IGNORECASE) is not None
     if utc:
         notes.append(f"{path.name}: times are taken as seconds of UTC, as its name says")
+    if datum := re.search(rf"(?<![a-z0-9])({_DATUMS})(?![0-9])", path.stem, re.IGNORECASE):
+        notes.append(f"{path.name}: positions are taken as WGS 84, though its name says {datum[1]}")
     time = times_from_gps(path, column["time"], day, notes, of_day=of_day, utc=utc)
     with np.errstate(over="ignore"):  # a damaged file overflows here and is refused below
         lat_lon = np.degrees(np.column_stack([column["lat"], column["lon"]]))

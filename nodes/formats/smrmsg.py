@@ -52,10 +52,11 @@ def is_smrmsg(path: Path) -> bool:
 def beside(sbet: Path) -> Path | None:
     """The SMRMSG in the folder of an SBET under its name, if there is one.
 
-    That of ``sbet_7.out`` is ``smrmsg_7.out`` or ``sbet_7-smrmsg.out``.
+    That of ``sbet_7.out`` is ``smrmsg_7.out`` or ``sbet_7-smrmsg.out``; some programs write one word in capitals.
     """
-    name = re.sub("sbet", lambda said: "SMRMSG" if said[0].isupper() else "smrmsg", sbet.name, flags=re.IGNORECASE)
-    names = (name, f"{sbet.stem}-smrmsg{sbet.suffix}", f"{sbet.stem}_smrmsg{sbet.suffix}")
+    words = ("smrmsg", "SMRMSG")
+    names = [re.sub("sbet", word, sbet.name, flags=re.IGNORECASE) for word in words]
+    names += [f"{sbet.stem}{sign}{word}{sbet.suffix}" for word in words for sign in "-_"]
     return next((path for path in map(sbet.with_name, names) if path != sbet and path.is_file()), None)
 
 

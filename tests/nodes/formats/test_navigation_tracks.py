@@ -335,6 +335,15 @@ def test_pos_export_gives_east_before_north(tmp_path):
 
 
 @needs_data
+def test_pos_export_with_longitudes_to_360_degrees_agrees_with_its_grid(tmp_path):
+    path = tmp_path / "pos.txt"
+    path.write_text(re.sub(r" -115\.(\d+)", lambda said: f" {360 - float(f'115.{said[1]}'):.8f}", POS.read_text()))
+    track = read_pos_export(path, date(2009, 3, 5))
+    np.testing.assert_allclose(track.geodetic[0], [35.97443318, 244.86250835, 711.549])
+    assert not track.notes  # it was 32 338 796 m off
+
+
+@needs_data
 def test_pos_export_without_latitude(tmp_path):
     """The mapping frame of the header stands in."""
     rows = POS.read_text().splitlines()
@@ -479,6 +488,14 @@ def test_sbet_in_seconds_of_utc_by_its_name(tmp_path, name, behind_s):
     track = read_sbet(path, date(2020, 6, 6))
     assert track.time_ns.tolist() == [ns("2020-06-06T23:59:59") - behind_s * 10**9 + k * 500_000_000 for k in range(3)]
     assert any("as its name says" in note for note in track.notes) == (behind_s == 0)
+
+
+@pytest.mark.parametrize(("name", "datum"), [("S222_NAD83_SBET.out", "NAD83"), ("sbet_gda2020.out", "gda2020")])
+def test_sbet_of_another_datum_by_its_name_is_told(tmp_path, name, datum):
+    track = straight_track()
+    path = tmp_path / name
+    write_sbet(path, gps_from_utc_ns(track.time_ns)[1], track.geodetic, track.rpy, np.zeros((50, 3)))
+    assert f"{name}: positions are taken as WGS 84, though its name says {datum}" in read_sbet(path).notes
 
 
 def test_sbet_damaged(tmp_path):

@@ -17,7 +17,7 @@ from triline.nodes.formats.detect import Options, read_any
 from triline.nodes.formats.flight_folder import read_flight, write_template
 from triline.nodes.formats.gps_time import gps_from_utc_ns
 from triline.nodes.formats.sbet import read_sbet
-from triline.nodes.formats.smrmsg import write_smrmsg
+from triline.nodes.formats.smrmsg import beside, write_smrmsg
 
 DAY = date(2020, 6, 1)
 SECONDS = gps_from_utc_ns(straight_track().time_ns)[1]
@@ -40,12 +40,22 @@ def test_records_are_what_other_programs_read(tmp_path):
     )
 
 
-@pytest.mark.parametrize("name", ["sbet_x-smrmsg.out", "sbet_x_smrmsg.out"])
-def test_accuracies_beside_an_sbet_may_be_named_behind_it(tmp_path, name):
-    """As TerraPos names them."""
-    sbet = write_sbet_file(tmp_path)
-    write_accuracies(tmp_path / name, SECONDS[[0, -1]])
-    assert f"sbet_x.out: accuracies of the poses are those of {name}" in read_sbet(sbet, DAY).notes
+@pytest.mark.parametrize(
+    ("sbet", "smrmsg"),
+    [
+        ("sbet--UTCtime-x-WGS84.out", "sbet--UTCtime-x-WGS84-smrmsg.out"),
+        ("x-sbet-200Hz.out", "x-sbet-200Hz-smrmsg.out"),
+        ("S222_2020-077_NAD83_SBET.out", "S222_2020-077_NAD83_smrmsg.out"),
+        ("SBET_ppk.OUT", "SMRMSG_ppk.OUT"),
+    ],
+)
+def test_accuracies_beside_an_sbet_have_the_names_that_programs_give(tmp_path, sbet, smrmsg):
+    """Those of files of TerraPos, of POSPac in hydrography and of Inertial Explorer."""
+    path = write_sbet_file(tmp_path).rename(tmp_path / sbet)
+    assert beside(path) is None
+    write_accuracies(tmp_path / smrmsg, SECONDS[[0, -1]])
+    assert beside(path) == tmp_path / smrmsg
+    assert read_sbet(path, DAY).has_accuracies
 
 
 def test_accuracies_beside_an_sbet_are_interpolated(tmp_path):
