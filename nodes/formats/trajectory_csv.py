@@ -124,6 +124,8 @@ def _track(table: Table, crs: str | None, day: date | None, notes: list[str]) ->
         sigma_m = sigma_rpy = None
     else:
         geodetic = np.column_stack([_in_degrees(table, names[q]) for q in ("lat", "lon", "height")])
+        if "alt" in names["height"].lower():
+            notes.append(f"{path.name}: {names['height']} is taken as height above the ellipsoid (WGS 84)")
         rpy = np.radians(np.column_stack([_in_degrees(table, names[q]) for q in ("roll", "pitch", "heading")]))
         covariance = None
         sigma_m = table.stack(*sigmas[:3]) if given else None

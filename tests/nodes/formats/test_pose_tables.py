@@ -103,6 +103,8 @@ def test_radians_stated_in_the_header(tmp_path, columns):
     track = read_track(path, "csv", Options())
     np.testing.assert_allclose(track.geodetic[:, :2], np.column_stack([LAT, LON]), atol=1e-6)
     np.testing.assert_allclose(np.degrees(track.rpy[2]), [1.5, -2.5, 45.0], atol=1e-6)
+    told = "p.csv: Altitude (m) is taken as height above the ellipsoid (WGS 84)"
+    assert (told in track.notes) == ("Altitude" in columns)
 
 
 def test_decimal_commas_and_sigmas_as_navigate_writes_them(tmp_path):
