@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from .byte_order_mark import without_mark
@@ -56,6 +57,16 @@ def other_kind(path: Path) -> str | None:
         return _scene("metadata of a satellite scene")
     if suffix == ".times" or is_frame_index(path):
         return "times of image lines, which `triline import` finds beside their image, or takes by --line-times"
+    if re.search(rb"\$[A-Z]{2}(GGA|RMC|ZDA),", head):
+        return (
+            'NMEA of a receiver, which `triline fly` reads: a [[sensor]] of kind = "nmea" in a flight.toml, '
+            'with address = "file:NAME"'
+        )
+    if re.search(rb"Program:\s+(Inertial Explorer|GrafNav)", head):
+        return (
+            "text of Inertial Explorer or GrafNav; wanted its SBET, or its table as CSV below the header "
+            "week,sow_s,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg (GPS time, H-Ell)"
+        )
     if name in PARTS:
         return f"{PARTS[name]}, which is given as a whole"
     return None

@@ -417,6 +417,20 @@ def test_foreign_files_get_one_line(tmp_path, capsys):
     assert not out.exists() and not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.parametrize(
+    ("head", "wanted"),
+    [
+        ("$GNGGA,092750.20,5321.6802,N,00630.3372,W,4,18,0.8,61.7,M,55.2,M,,*5E\n", 'kind = "nmea" in a flight.toml'),
+        ("Project:     x\nProgram:     Inertial Explorer Version 8.90.6611\n", "week,sow_s,lat_deg,lon_deg,height_m,"),
+        ("Project:     x\n\nProgram:     GrafNav Version 9.00.2207\n", "text of Inertial Explorer or GrafNav"),
+    ],
+)
+def test_navigation_of_receivers_and_other_programs_is_named(tmp_path, capsys, head, wanted):
+    path = tmp_path / "navigation.txt"
+    path.write_text(head * 20)
+    assert wanted in _refused(capsys, str(path), "-o", str(tmp_path / "out.mcap"))
+
+
 def write_sbet_file(folder: Path) -> Path:
     track = straight_track()
     path = folder / "sbet_x.out"
