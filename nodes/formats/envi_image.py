@@ -90,6 +90,9 @@ def open_envi(path: Path) -> EnviImage:
     if names and len(names) != bands:
         raise UserError(f"{header_path}: band names: {len(names)} names, wanted {bands}")
     notes = (f"{path.name}: {size - wanted} bytes after the last line, not read",) if size > wanted else ()
+    dark = header.get("autodarkstartline", "")
+    if dark.isdecimal() and 0 < int(dark) < lines:
+        notes += (f"{path.name}: lines from {dark} on are dark (autodarkstartline), not of the ground",)
     return EnviImage(
         path=path, lines=lines, samples=samples, bands=bands, kind=kind, offset=offset, interleave=interleave,
         names=names, notes=notes,

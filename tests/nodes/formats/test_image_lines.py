@@ -80,6 +80,16 @@ def test_names_in_capitals(tmp_path, header):
         np.testing.assert_array_equal(GreyImage(opened, opened.weights("2")).read(0, 50), cube[..., 1])
 
 
+def test_dark_lines_at_the_end_are_told(tmp_path):
+    """A header as recorders of Specim write it."""
+    image = write_image(tmp_path / "a.raw", cube_of("u2"))
+    assert open_envi(image).notes == ()
+    more = "errors = {none}\nStart Time = UTC TIME: 22:47:35\ndefault bands = {\n2,1\n}\nautodarkstartline = 40\n"
+    header = tmp_path / "a.hdr"
+    header.write_text(header.read_text() + more)
+    assert open_envi(image).notes == ("a.raw: lines from 40 on are dark (autodarkstartline), not of the ground",)
+
+
 def test_bands_by_name_and_values_in_a_range(tmp_path):
     cube = cube_of("f4") / np.float32(400.0)
     cube[0, 0, 1], cube[0, 1, 1] = np.nan, 2.0
