@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from datetime import date, timedelta
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -63,10 +63,7 @@ def read_sbet(
         if of_day:
             notes.append(f"{path.name}: times below one day, taken as seconds of {day}")
         elif day is not None and below and day.isoweekday() == 1:
-            what = f"taken as seconds of the week, of {day - timedelta(days=1)}, the day before --date"
-            notes.append(
-                f"{path.name}: times below one day, {what}; if they count from midnight, wanted --seconds-of-day"
-            )
+            notes.append(f"{path.name}: times below one day; if they count from midnight, wanted --seconds-of-day")
     utc = re.search(r"(?<![a-z])utc(time)?(?![a-z])", path.stem, re.IGNORECASE) is not None
     if utc:
         notes.append(f"{path.name}: times are taken as seconds of UTC, as its name says")

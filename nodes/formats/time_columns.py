@@ -186,5 +186,9 @@ def _from_gps(
         bad = ~((seconds >= low) & (seconds < high))
         wanted = f"wanted seconds of the week (0 to {WEEK_S}) or since 1980-01-06"
         table.refuse(bad, name, lambda i: f"{seconds[i]:.6g}, {wanted}")
-        return utc_ns_from_gps(0, seconds), True
+        time_ns = utc_ns_from_gps(0, seconds)
+        if day is None:
+            begin = np.datetime64(int(time_ns[0]), "ns").astype("datetime64[s]")
+            notes.append(f"{table.path.name}: {name} counts since 1980-01-06: the flight begins at {begin}Z")
+        return time_ns, True
     return times_from_gps(table.path, unwrap_weeks(seconds), day, notes), False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from datetime import date
+from datetime import date, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -233,6 +233,10 @@ def times_from_gps(
         raise UserError(f"{path}: GPS seconds of the week say {names[said]}, but {day} is a {names[weekday]}")
     if apart and abs(said - weekday) > 1:  # the week begins or ends between the two
         week += 1 if said < weekday else -1
+    if apart:
+        other = day + timedelta(days=apart)
+        what = f"of {other}, the day {'after' if apart > 0 else 'before'} --date"
+        notes.append(f"{path.name}: times are taken as seconds of the week, {what}")
     return ns_of(week, seconds)
 
 

@@ -436,9 +436,8 @@ def test_sbet_wander_angle_and_seconds_of_day(tmp_path):
         read_sbet(path, date(2020, 6, 3), seconds_of_day=False)
     monday = read_sbet(path, date(2020, 6, 8))  # its Sunday, or seconds of the day: nothing tells
     assert monday.time_ns[0] == ns("2020-06-07T00:01:22")
-    assert (
-        "of 2020-06-07, the day before --date; if they count from midnight, wanted --seconds-of-day" in monday.notes[0]
-    )
+    assert "times below one day; if they count from midnight, wanted --seconds-of-day" in monday.notes[0]
+    assert "times are taken as seconds of the week, of 2020-06-07, the day before --date" in monday.notes[1]
 
 
 @pytest.mark.parametrize("said", [True, None])

@@ -53,7 +53,9 @@ def test_times_of_every_kind(tmp_path, what, sep):
     path = write(tmp_path / "poses.csv", head, times, sep=sep)
     assert kind_of_path(path) == "csv"
     track = read_track(path, "csv", Options(day=day))
-    assert track.time_ns.tolist() == [ns(START) + i * 10**9 for i in range(N)] and not track.notes
+    assert track.time_ns.tolist() == [ns(START) + i * 10**9 for i in range(N)]
+    told = "poses.csv: gps_s counts since 1980-01-06: the flight begins at 2020-06-01T12:00:00Z"
+    assert track.notes == ((told,) if what == "since 1980" else ())
     np.testing.assert_allclose(track.geodetic, np.column_stack([LAT, LON, np.full(N, 2000.0)]), atol=1e-6)
     np.testing.assert_allclose(np.degrees(track.rpy[2]), [1.5, -2.5, 45.0])
 
@@ -62,6 +64,21 @@ def test_over_the_end_of_a_week(tmp_path):
     times = ["2108,604798", "2108,604799", *(f"2109,{i}" for i in range(N - 2))]
     track = read_track(write(tmp_path / "p.csv", "week,gps_s", times), "csv", Options())
     assert np.diff(track.time_ns).tolist() == [10**9] * (N - 1)
+
+
+@pytest.mark.parametrize(
+    ("first", "day", "told"),
+    [
+        (43_218, date(2020, 6, 1), "of 2020-05-31, the day before --date"),  # seconds of the day, of a Monday
+        (86_400 + 43_218, date(2020, 6, 1), None),
+        (86_400 + 43_218, date(2020, 5, 31), "of 2020-06-01, the day after --date"),
+        (6 * 86_400, date(2020, 6, 7), "of 2020-06-06, the day before --date"),  # a Sunday
+    ],
+)
+def test_seconds_of_the_week_of_another_day_than_the_one_given_are_told(tmp_path, first, day, told):
+    path = write(tmp_path / "poses.csv", "gps_s", [f"{first + i}" for i in range(N)])
+    notes = read_track(path, "csv", Options(day=day)).notes
+    assert notes == (() if told is None else (f"poses.csv: times are taken as seconds of the week, {told}",))
 
 
 def test_weeks_modulo_1024(tmp_path):
