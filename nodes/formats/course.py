@@ -12,9 +12,10 @@ Array = NDArray[np.floating]
 #: Steps over which the course is taken, s; those behind a gap do not count.
 _STEP_S, _GAP_S = 1.0, 5.0
 #: Aircraft that are slower may fly sideways, m/s.
-_SLOW_M_S = 10.0
-#: No crab angle is larger, degrees, and turns are those with a bank of at least and at most so much, degrees.
-_MOST_CRAB_DEG = 35.0
+SLOW_M_S = 10.0
+#: No crab angle is larger, degrees.
+MOST_CRAB_DEG = 35.0
+#: Turns are flown with a bank of at least and at most so much, degrees.
 _BANKS_DEG = (8.0, 60.0)
 #: So many steps have to say something.
 _FEWEST = 10
@@ -34,16 +35,18 @@ def attitude_remarks(time_ns: NDArray[np.int64], geodetic: Array, rpy: Array) ->
     Parameters
     ----------
     time_ns : (n,), rising
-    geodetic : (n, 3) latitude and longitude in degrees, height in metres
+    geodetic : (n, 2) latitude and longitude in degrees, or more columns
     rpy : (n, 3) roll, pitch, heading, radians
     """
+    if len(time_ns) < 3:
+        return []
     step = max(round(_STEP_S * 1e9 / float(np.median(np.diff(time_ns)))), 1)
     apart_s = np.diff(time_ns[::step]) * 1e-9
     lat, lon = np.radians(geodetic[::step, :2].T)
     north = np.diff(lat) * SEMI_MAJOR_M
     east = _wrapped(np.diff(lon)) * SEMI_MAJOR_M * np.cos(lat[:-1])
     speed = np.hypot(north, east) / apart_s
-    counts = (speed > _SLOW_M_S) & (apart_s < _GAP_S)
+    counts = (speed > SLOW_M_S) & (apart_s < _GAP_S)
     course, heading, roll = np.arctan2(east, north), rpy[::step, 2][:-1], rpy[::step, 0]
     remarks = []
     if counts.sum() >= _FEWEST:
@@ -61,7 +64,7 @@ def _wrapped(angle: Array) -> Array:
 
 def _of_heading(heading: Array, course: Array) -> list[str]:
     def share(said: Array) -> float:
-        return float(np.mean(np.abs(_wrapped(said - course)) < np.radians(_MOST_CRAB_DEG)))
+        return float(np.mean(np.abs(_wrapped(said - course)) < np.radians(MOST_CRAB_DEG)))
 
     if share(heading) > 0.2:
         return []

@@ -10,14 +10,13 @@ import numpy as np
 
 from ...solver.geometry.earth import ecef_from_geodetic
 from ..errors import UserError
+from .course import MOST_CRAB_DEG
 from .track import NavigationTrack
 
 #: Aircraft that carry a line camera fly faster than this and slower than that, m/s.
 SPEEDS_M_S = (5.0, 350.0)
 #: The course is compared with the heading where the flight is faster than this, m/s, and long enough, m.
 _MOVING = (1.0, 30.0)
-#: No crab angle is larger, degrees.
-_MOST_CRAB_DEG = 35.0
 
 
 def check_units(track: NavigationTrack, path: Path, names: Mapping[str, str] | None = None) -> NavigationTrack:
@@ -77,7 +76,7 @@ def _check_heading(track: NavigationTrack, path: Path, name: str, length_m: floa
     if np.abs(said).max() > 2 * np.pi:
         return
     off, off_rad = (float(np.median(np.abs((h - course + 180) % 360 - 180))) for h in (said, np.degrees(said)))
-    if off > _MOST_CRAB_DEG and off_rad < min(_MOST_CRAB_DEG, off / 3):
+    if off > MOST_CRAB_DEG and off_rad < min(MOST_CRAB_DEG, off / 3):
         what = (
             f"headings up to {np.abs(said).max():.3g}, and {off:.0f} deg off the course, {off_rad:.0f} deg in radians"
         )

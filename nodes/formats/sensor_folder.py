@@ -16,6 +16,7 @@ from ...solver.navigation.inertial_cleaning import Finding, clean_gnss, clean_in
 from ...solver.navigation.inertial_data import MEMS, GnssData, InertialData, InertialGrade
 from ..convert import LATEST_S
 from ..errors import UserError
+from .course import attitude_remarks
 from .keys import Keys, read_toml
 from .rtklib import read_rtklib
 from .table import Column, Table, read_table, separator_of
@@ -196,6 +197,8 @@ def read_sensor_folder(path: str | Path, platform_file: Path | None = None) -> S
         raise UserError(f"{folder}: gnss.csv and gnss.pos, wanted one of them")
     gnss = read_rtklib(rtklib, notes) if rtklib.is_file() else _read_gnss(folder / "gnss.csv", notes)
     attitude = _read_attitude(folder / "attitude.csv", notes)
+    if gnss is not None and attitude is not None:
+        notes.extend(f"attitude.csv: {remark}" for remark in _remarks(gnss, attitude))
     platform = read_platform(platform_file or folder / "platform.toml", notes)
     if platform.initial is None and attitude is not None and time is not None:
         platform = replace(platform, initial=_initial_of(attitude, float(time.min())))
@@ -301,6 +304,17 @@ def _read_attitude(path: Path, notes: list[str]) -> AttitudeTable | None:
     rows, findings = in_order(time, "attitude.time", "attitudes")
     notes.extend(f"{path.name}: time_s: {finding.text}" for finding in findings)
     return AttitudeTable(time[rows], angles[rows], np.radians(sigma[rows]))
+
+
+def _remarks(gnss: GnssData, attitude: AttitudeTable) -> list[str]:
+    """Whether the attitudes go with the flight of the fixes."""
+    known = np.isfinite(gnss.time_s) & np.isfinite(gnss.lat) & np.isfinite(gnss.lon)
+    known &= (gnss.time_s >= attitude.time_s[0]) & (gnss.time_s <= attitude.time_s[-1])
+    time_s, first = np.unique(gnss.time_s[known], return_index=True)
+    angles = np.unwrap(attitude.angles, axis=0)
+    rpy = np.column_stack([np.interp(time_s, attitude.time_s, angle) for angle in angles.T])
+    geodetic = np.degrees(np.column_stack([gnss.lat[known][first], gnss.lon[known][first]]))
+    return attitude_remarks(np.rint((time_s - attitude.time_s[0]) * 1e9).astype(np.int64), geodetic, rpy)
 
 
 def _initial_of(attitude: AttitudeTable, time_s: float) -> AttitudePrior | None:

@@ -20,6 +20,7 @@ import numpy as np
 from pynmeagps import GET, VALCKSUM, NMEAReader
 
 from ..convert import SECOND_NS, attitude_message, check_place, gnss_message
+from ..formats.course import MOST_CRAB_DEG, SLOW_M_S
 from ..formats.gps_time import WEEK_ROLLOVER
 from ..formats.keys import Keys
 from ..node import Message
@@ -42,6 +43,8 @@ GST_HOLDS_S = 5.0
 UNKNOWN_CLIMB_M_S = 20.0
 #: No sentence is longer (82 by the standard; some receivers write more), bytes.
 LONGEST = 512
+#: So many headings are compared with the course.
+HEADINGS = 20
 KNOT_M_S = 1852.0 / 3600.0
 #: A minute of latitude, m.
 MINUTE_M = 1852.0
@@ -107,6 +110,7 @@ class NmeaParser:
         self._motion: tuple[int, tuple[float, float]] | None = None  # east and north velocity, of an RMC
         self._few_told = False  # that fixes are rounded
         self._era_told = False  # that weeks count modulo 1024
+        self._off_deg: list[float] = []  # of the first headings from the course
 
     def feed(self, data: bytes) -> list[Message]:
         """The messages that follow from more bytes."""
@@ -204,9 +208,22 @@ class NmeaParser:
         if not settings.heading_sigma_deg or self._epoch_ns == self._last_heading_ns:
             return []
         self._last_heading_ns = self._epoch_ns
+        self._compare_with_course(heading_deg)
         sigma = np.radians([settings.level_sigma_deg, settings.level_sigma_deg, settings.heading_sigma_deg])
         body = attitude_message(self._epoch_ns, np.radians([0.0, 0.0, heading_deg]), sigma)
         return [Message("sensor/attitude", settings.clock.stamp(self._epoch_ns), body)]
+
+    def _compare_with_course(self, heading_deg: float) -> None:
+        """Tell where the first headings of a fast flight lie off the course, as of antennas across the aircraft."""
+        if self._motion is None or abs(self._motion[0] - self._epoch_ns) > SECOND_NS or len(self._off_deg) == HEADINGS:
+            return
+        east, north = self._motion[1]
+        if math.hypot(east, north) > SLOW_M_S:
+            off_deg = heading_deg - math.degrees(math.atan2(east, north))
+            self._off_deg.append(abs((off_deg + 180.0) % 360.0 - 180.0))
+        if len(self._off_deg) == HEADINGS and np.quantile(self._off_deg, 0.2) > MOST_CRAB_DEG:
+            what = f"HDT lies {np.median(self._off_deg):.0f} deg off the course of RMC (median of {HEADINGS})"
+            self._problem("heading off the course", f"{what}: are the antennas across the aircraft?")
 
     # ---- time and accuracy
 

@@ -9,6 +9,7 @@ import pytest
 
 from triline.nodes.formats.course import attitude_remarks
 from triline.nodes.formats.sbet import read_sbet, write_sbet
+from triline.nodes.formats.sensor_folder import read_sensor_folder
 
 RIGHT = "the flight turns left where the roll is to the right: wanted positive with the right wing down"
 
@@ -61,6 +62,20 @@ def test_an_aircraft_that_hovers_may_look_anywhere():
     time_s, geodetic, rpy = lines_with_turns()
     slow_ns = np.rint(time_s * 1e10).astype(np.int64)  # ten times as long
     assert attitude_remarks(slow_ns, geodetic, rpy + np.array([0.0, 0.0, np.pi])) == []
+
+
+def test_attitudes_of_a_sensor_folder_are_held_against_its_fixes(tmp_path):
+    time_s, geodetic, rpy = lines_with_turns()
+    fixes = [f"{t:.1f},{a:.8f},{b:.8f},{h},1,1,2" for t, (a, b, h) in zip(time_s[::10], geodetic[::10], strict=True)]
+    (tmp_path / "gnss.csv").write_text(
+        "\n".join(["time_s,lat_deg,lon_deg,height_m,sigma_n_m,sigma_e_m,sigma_d_m", *fixes])
+    )
+    for sign in (1, -1):
+        rows = [f"{t:.1f},{r:.4f},{p:.4f},{sign * h:.4f}" for t, (r, p, h) in zip(time_s, np.degrees(rpy), strict=True)]
+        (tmp_path / "attitude.csv").write_text("\n".join(["time_s,roll_deg,pitch_deg,heading_deg", *rows]))
+        notes = read_sensor_folder(tmp_path).notes
+        told = [note for note in notes if note.startswith("attitude.csv: headings are") and "counter-clockwise" in note]
+        assert len(told) == (sign == -1)
 
 
 def test_a_reader_passes_on_what_is_remarked(tmp_path):

@@ -194,6 +194,18 @@ def test_without_a_date_there_is_no_time(tmp_path):
     assert len(messages) == 1 and counts == {"no date yet": 1}
 
 
+@pytest.mark.parametrize(
+    ("heading", "knots", "told"), [(95.0, 120, 0), (120.0, 120, 0), (180.0, 120, 1), (275.0, 120, 1), (275.0, 12, 0)]
+)
+def test_headings_of_antennas_across_the_aircraft_are_told_once(tmp_path, heading, knots, told):
+    """The course is 90 deg."""
+    clocks = [f"0927{10 + i}.00" for i in range(45)]
+    rmc = f"GNRMC,{{}},A,5321.6802,N,00630.3372,W,{knots}.00,090.00,221126,,,A"
+    data = b"".join(sentence(rmc.format(c)) + gga(c) + sentence(f"GNHDT,{heading},T") for c in clocks)
+    messages, counts = parse(tmp_path, data, heading_sigma_deg=0.2)
+    assert len(messages) == 90 and counts["heading off the course"] == told
+
+
 def test_the_date_of_a_receiver_without_a_fix_is_not_believed(tmp_path):
     """As a real one wrote them: its first fix went out with a day in 1980."""
     before = sentence("GPRMC,235952.953,V,0000.0000,N,00000.0000,E,,0.00,050180,,,N")
