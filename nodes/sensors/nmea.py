@@ -183,6 +183,14 @@ class NmeaParser:
         if s.sep == "" or s.alt == "":
             self._problem("no geoid separation", "GGA without height above the ellipsoid")
             return []
+        _, latitude, north, longitude, east = s.payload[:5]
+        if north not in ("N", "S") or east not in ("E", "W") or "-" in latitude + longitude:
+            self._problem("no hemisphere", f"GGA at {latitude} {north}, {longitude} {east}, wanted N or S, and E or W")
+            return []
+        units = s.altUnit, getattr(s, "sepUnit", "")
+        if set(units) - {"M", ""}:
+            self._problem("not in metres", f"GGA with heights in {' and '.join(units)}, wanted M")
+            return []
         utc_ns = self._utc(s.time)
         if utc_ns is None:
             self._problem("no date yet", "GGA before the first RMC or ZDA; or give date")

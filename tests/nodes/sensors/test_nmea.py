@@ -161,6 +161,9 @@ def test_heading_and_velocity_where_they_are_wanted(tmp_path):
         (gga("092750.20", lat=""), "field missing"),
         (gga("092750.20", lat="9521.680200"), "field missing"),
         (gga("092750.20") * 2, "time does not go on"),
+        (sentence("GNGGA,092750.20,5321.6802,,00630.3372,,4,18,0.8,61.7,M,55.2,M,1.0,0000"), "no hemisphere"),
+        (sentence("GNGGA,092750.20,-3321.6802,N,00630.3372,E,4,18,0.8,61.7,M,55.2,M,1.0,0000"), "no hemisphere"),
+        (sentence("GNGGA,092750.20,5321.6802,N,00630.3372,W,4,18,0.8,202.4,F,181.1,F,1.0,0000"), "not in metres"),
     ],
 )
 def test_what_cannot_be_used_is_counted_and_the_next_fix_comes(tmp_path, data, kind):
