@@ -17,6 +17,8 @@ SLOW_M_S = 10.0
 MOST_CRAB_DEG = 35.0
 #: Turns are flown with a bank of at least and at most so much, degrees.
 _BANKS_DEG = (8.0, 60.0)
+#: The median of roll or pitch of a flight is not larger, degrees.
+_MOST_TILT_DEG = 45.0
 #: So many steps have to say something.
 _FEWEST = 10
 #: Other conventions -> the heading by them, of the one that stands in the file.
@@ -29,26 +31,30 @@ _CONVENTIONS = {
 }
 
 
-def attitude_remarks(time_ns: NDArray[np.int64], geodetic: Array, rpy: Array) -> list[str]:
-    """Remarks about headings and rolls of another convention than that of `solver`; none where nothing tells.
+def attitude_remarks(time_s: Array, geodetic: Array, rpy: Array) -> list[str]:
+    """Remarks about attitudes of another convention than that of `solver`; none where nothing tells.
 
     Parameters
     ----------
-    time_ns : (n,), rising
+    time_s : (n,), rising
     geodetic : (n, 2) latitude and longitude in degrees, or more columns
     rpy : (n, 3) roll, pitch, heading, radians
     """
-    if len(time_ns) < 3:
+    if len(time_s) < 3:
         return []
-    step = max(round(_STEP_S * 1e9 / float(np.median(np.diff(time_ns)))), 1)
-    apart_s = np.diff(time_ns[::step]) * 1e-9
+    step = max(round(_STEP_S / max(float(np.median(np.diff(time_s))), 1e-6)), 1)
+    apart_s = np.diff(time_s[::step])
     lat, lon = np.radians(geodetic[::step, :2].T)
     north = np.diff(lat) * SEMI_MAJOR_M
     east = _wrapped(np.diff(lon)) * SEMI_MAJOR_M * np.cos(lat[:-1])
     speed = np.hypot(north, east) / apart_s
     counts = (speed > SLOW_M_S) & (apart_s < _GAP_S)
     course, heading, roll = np.arctan2(east, north), rpy[::step, 2][:-1], rpy[::step, 0]
+    tilt_deg = np.degrees(np.median(np.abs(rpy[:, :2]), axis=0))
     remarks = []
+    if tilt_deg.max() > _MOST_TILT_DEG:
+        what = " and ".join(f"{angle:.0f}" for angle in tilt_deg)
+        remarks.append(f"roll and pitch are {what} deg off level (median): are the axes forward, right and down?")
     if counts.sum() >= _FEWEST:
         remarks += _of_heading(heading[counts], course[counts])
     both = counts[:-1] & counts[1:]

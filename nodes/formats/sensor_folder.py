@@ -308,13 +308,13 @@ def _read_attitude(path: Path, notes: list[str]) -> AttitudeTable | None:
 
 def _remarks(gnss: GnssData, attitude: AttitudeTable) -> list[str]:
     """Whether the attitudes go with the flight of the fixes."""
-    known = np.isfinite(gnss.time_s) & np.isfinite(gnss.lat) & np.isfinite(gnss.lon)
+    known = (np.abs(gnss.lat) <= np.pi / 2) & (np.abs(gnss.lon) <= 2 * np.pi)
     known &= (gnss.time_s >= attitude.time_s[0]) & (gnss.time_s <= attitude.time_s[-1])
     time_s, first = np.unique(gnss.time_s[known], return_index=True)
     angles = np.unwrap(attitude.angles, axis=0)
     rpy = np.column_stack([np.interp(time_s, attitude.time_s, angle) for angle in angles.T])
     geodetic = np.degrees(np.column_stack([gnss.lat[known][first], gnss.lon[known][first]]))
-    return attitude_remarks(np.rint((time_s - attitude.time_s[0]) * 1e9).astype(np.int64), geodetic, rpy)
+    return attitude_remarks(time_s, geodetic, rpy)
 
 
 def _initial_of(attitude: AttitudeTable, time_s: float) -> AttitudePrior | None:

@@ -168,8 +168,9 @@ def checked(track: NavigationTrack, path: Path, rows: NDArray[np.intp] | None = 
     if not rising.all():
         note = f"{path.name}: {int((~rising).sum())} poses do not come after the one before them and were left out"
         track, number = _part(track, rising, note), number[rising]
-    remarks = (f"{path.name}: {remark}" for remark in attitude_remarks(track.time_ns, track.geodetic, track.rpy))
-    return _with_jumps(replace(track, notes=(*track.notes, *remarks)), path, number)
+    remarks = attitude_remarks((track.time_ns - track.time_ns[0]) * 1e-9, track.geodetic, track.rpy)
+    notes = (*track.notes, *(f"{path.name}: {remark}" for remark in remarks))
+    return _with_jumps(replace(track, notes=notes), path, number)
 
 
 def _part(track: NavigationTrack, which: NDArray[np.bool_], note: str) -> NavigationTrack:

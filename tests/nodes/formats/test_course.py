@@ -31,7 +31,7 @@ def lines_with_turns(crab=0.0):
 
 def remarks_of(change, crab=0.0):
     time_s, geodetic, rpy = lines_with_turns(crab)
-    return attitude_remarks(np.rint(time_s * 1e9).astype(np.int64), geodetic, change(rpy))
+    return attitude_remarks(time_s, geodetic, change(rpy))
 
 
 @pytest.mark.parametrize("crab", [-0.4, 0.0, 0.4])
@@ -58,10 +58,20 @@ def test_headings_and_rolls_of_another_convention_are_told(change, wanted):
     assert wanted in remark
 
 
+def test_times_that_are_next_to_each_other_do_no_harm():
+    time_s = np.cumsum(np.full(9, 5e-324))
+    assert attitude_remarks(time_s, np.zeros((9, 3)), np.zeros((9, 3))) == []
+
+
+@pytest.mark.parametrize(("tilt", "wanted"), [((np.pi, 0.0), "180 and 0"), ((0.0, 1.5), "0 and 86")])
+def test_axes_that_point_up_are_told(tilt, wanted):
+    remarks = remarks_of(lambda rpy: np.column_stack([np.full((len(rpy), 2), tilt), rpy[:, 2]]))
+    assert remarks == [f"roll and pitch are {wanted} deg off level (median): are the axes forward, right and down?"]
+
+
 def test_an_aircraft_that_hovers_may_look_anywhere():
     time_s, geodetic, rpy = lines_with_turns()
-    slow_ns = np.rint(time_s * 1e10).astype(np.int64)  # ten times as long
-    assert attitude_remarks(slow_ns, geodetic, rpy + np.array([0.0, 0.0, np.pi])) == []
+    assert attitude_remarks(10.0 * time_s, geodetic, rpy + np.array([0.0, 0.0, np.pi])) == []
 
 
 def test_attitudes_of_a_sensor_folder_are_held_against_its_fixes(tmp_path):
