@@ -478,7 +478,7 @@ def test_sbet_over_the_end_of_a_week(tmp_path):
     ],
 )
 def test_sbet_in_seconds_of_utc_by_its_name(tmp_path, name, behind_s):
-    """As TerraPos names them, which writes such ones."""
+    """Names of real files."""
     path = tmp_path / name
     values = np.zeros((3, 17))
     values[:, 0] = [604799.0, 604799.5, 0.0]

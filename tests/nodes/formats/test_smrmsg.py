@@ -50,7 +50,7 @@ def test_records_are_what_other_programs_read(tmp_path):
     ],
 )
 def test_accuracies_beside_an_sbet_have_the_names_that_programs_give(tmp_path, sbet, smrmsg):
-    """Those of files of TerraPos, of POSPac in hydrography and of Inertial Explorer."""
+    """Those of real files, two of them of POSPac in hydrography and of Inertial Explorer."""
     path = write_sbet_file(tmp_path).rename(tmp_path / sbet)
     assert beside(path) is None
     write_accuracies(tmp_path / smrmsg, SECONDS[[0, -1]])
