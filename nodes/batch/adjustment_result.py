@@ -306,11 +306,17 @@ def _expected(result: BatchResult, given: Control, sigma_m: Any, *, independent:
     found = next((c.factor for c in result.components if c.group == "control"), 1.0)
     # sigmas of control scale with the others, and with the factor that was found for them
     sign, scale = (1.0, 1.0) if independent else (-1.0, result.sigma0 * found)
-    variance = np.where(used, (scale * given.sigma_m) ** 2 + sign * sigma_m[given.point] ** 2, 0.0)
+    variance = (scale * given.sigma_m) ** 2 + sign * sigma_m[given.point] ** 2
+    return expected_rmse(np.where(used, variance, np.nan))
+
+
+def expected_rmse(variance: Array) -> dict[str, Any]:
+    """What is said of differences with variances (k, 3), NaN where nothing is compared; nothing where none is."""
+    used = np.isfinite(variance)
     n = used.sum(axis=0)
     if not n.any():
         return {}
-    mean = np.maximum(variance, 0.0).sum(axis=0) / np.maximum(n, 1)
+    mean = np.where(used, np.maximum(variance, 0.0), 0.0).sum(axis=0) / np.maximum(n, 1)
     return {"expected_m": np.where(n > 0, np.sqrt(mean), np.nan).tolist()}
 
 
@@ -485,15 +491,17 @@ def _test_notes(adjustment: Adjustment) -> list[str]:
     return notes + failing_note(network.point_ids, w, critical) + _deserted_control(result)
 
 
-def failing_note(points: Sequence[str], w: Array, critical: float) -> list[str]:
-    """What is said of control whose normalised residuals (p, 3), adjusted minus given, fail; nothing where none do."""
+def failing_note(
+    points: Sequence[str], w: Array, critical: float, what: str = "control coordinates", axes: Sequence[str] = "XYZ"
+) -> list[str]:
+    """What is said of normalised residuals (p, axes), adjusted minus given, that fail; nothing where none do."""
     worst = [(p, a) for p, a in np.argwhere(np.abs(w) > critical)]
     worst.sort(key=lambda key: -abs(w[key]))
     if not worst:
         return []
-    names = ", ".join(f"{points[p]} {'XYZ'[a]} ({w[p, a]:+.1f})" for p, a in worst[:5])
+    names = ", ".join(f"{points[p]} {axes[a]} ({w[p, a]:+.1f})" for p, a in worst[:5])
     more = " ..." if len(worst) > 5 else ""
-    return [f"{len(worst)} control coordinates have |w| > {critical:g}: {names}{more}"]
+    return [f"{len(worst)} {what} have |w| > {critical:g}: {names}{more}"]
 
 
 def _deserted_control(result: BatchResult) -> list[str]:

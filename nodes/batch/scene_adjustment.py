@@ -48,6 +48,7 @@ from .adjustment_result import (
     MOST_LISTED,
     deserted_note,
     elsewhere,
+    expected_rmse,
     failing_note,
     reliability_summary,
     single_accuracy,
@@ -463,13 +464,7 @@ def _expected(a: SceneAdjustment, sigma: Array, survey: Array, *, independent: b
     sigma : (k, 3) of the adjusted points, NaN where nothing is compared
     survey : (k, 3) variances of the given coordinates, 0 where none is stated
     """
-    both = survey + sigma**2 if independent else np.maximum(a.sigma0**2 * survey - sigma**2, 0.0)
-    used = np.isfinite(both)
-    n = used.sum(axis=0)
-    if not n.any():
-        return {}
-    mean = np.where(used, both, 0.0).sum(axis=0) / np.maximum(n, 1)
-    return {"expected_m": np.where(n > 0, np.sqrt(mean), np.nan).tolist()}
+    return expected_rmse(survey + sigma**2 if independent else a.sigma0**2 * survey - sigma**2)
 
 
 def _beforehand(problem: Problem, solution: SceneSolution) -> Any:
@@ -613,16 +608,8 @@ def _control_notes(a: SceneAdjustment) -> list[str]:
 def _single_look_note(a: SceneAdjustment) -> list[str]:
     """Pixels of check points of one ray that lie elsewhere than the adjusted image says; nothing where none do."""
     alone = a.single_looks
-    worst = [(i, k) for i, k in np.argwhere(np.abs(alone.test) > a.job.critical)]
-    worst.sort(key=lambda key: -abs(alone.test[key]))
-    if not worst:
-        return []
-    shown = (
-        f"{a.data.point_ids[a.data.rays.point[alone.rays[i]]]} {('line', 'sample')[k]} ({alone.test[i, k]:+.1f})"
-        for i, k in worst[:5]
-    )
-    more = " ..." if len(worst) > 5 else ""
-    return [f"{len(worst)} pixels of check points have |w| > {a.job.critical:g}: {', '.join(shown)}{more}"]
+    points = [a.data.point_ids[p] for p in a.data.rays.point[alone.rays]]
+    return failing_note(points, alone.test, a.job.critical, "pixels of check points", ("line", "sample"))
 
 
 # tables
