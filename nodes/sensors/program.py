@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..bus.session import Bus
 
 #: Keys that each sensor table may have.
-COMMON = ("id", "kind", "clock_offset_s", "delay_s", "imu_noise")
+COMMON = ("id", "kind", "clock_offset_s", "delay_s")
 #: So long a program that may have been started again waits for the recorder, which knows, s.
 RECORDER_S = 2.0
 #: Where a program waits for data it looks this often whether it shall end, s.

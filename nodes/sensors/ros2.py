@@ -36,7 +36,7 @@ from .program import LOOK_S, Clock, Sensor, noise_of, publish, refuse_unknown
 if TYPE_CHECKING:
     from ..bus.program import ProgramOptions
 
-KEYS = ("endpoint", "domain", "imu", "fix", "images", "line_rate_hz", "strip")
+KEYS = ("endpoint", "domain", "imu", "fix", "images", "line_rate_hz", "strip", "imu_noise")
 #: Samples that wait to be decoded; then ROS publishers are slowed down.
 _DEPTH = 2000
 #: A strip begins when all topics of images have, or one of them is so far ahead, s: publishers that start together.

@@ -37,7 +37,7 @@ from .program import LOOK_S, Clock, Sensor, noise_of, publish, refuse_unknown
 if TYPE_CHECKING:
     from ..bus.program import ProgramOptions
 
-KEYS = ("address", "baud")
+KEYS = ("address", "baud", "imu_noise")
 #: First word of a record -> the words that follow it. Times are UTC in ns since the Unix epoch.
 RECORDS = {
     b"GNSS": "time_ns lat_deg lon_deg height_m sigma_east_m sigma_north_m sigma_up_m",

@@ -308,6 +308,7 @@ def test_from_udp(tmp_path):
         ({"address": "ftp://x"}, "sensor[0].address: 'ftp://x', wanted serial:PORT, tcp://HOST:PORT"),
         ({"address": "tcp://host"}, "sensor[0].address: 'tcp://host', wanted a port from 1 to 65535"),
         ({"baut": 9600}, "sensor[0].baut: not known, wanted id, kind"),
+        ({"imu_noise": [1e-5, 1e-3]}, "sensor[0].imu_noise: not known, wanted id, kind"),
         ({"date": "today"}, "sensor[0].date: 'today', wanted a day as 2024-05-17"),
         ({"clock_offset_s": 1e300}, "sensor[0].clock_offset_s: 1e+300, wanted 100 years at most"),
         ({"delay_s": 60}, "sensor[0].delay_s: 60, wanted 0 to 5 seconds"),
