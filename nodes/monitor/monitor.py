@@ -293,8 +293,7 @@ def display(
     """
 
     def look() -> list[str]:
-        told = [] if watch is None else watch.look(overview.nodes)
-        return [] if overview.ending else told  # that a sensor falls silent is meant then
+        return [] if watch is None else watch.look(overview.nodes, ending=overview.ending)
 
     if quiet:
         yield lambda: (look(), None)[1]

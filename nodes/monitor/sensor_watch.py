@@ -94,8 +94,11 @@ class SensorWatch:
         self.said.append(text)
         self._pending.append(text)
 
-    def look(self, nodes: Mapping[str, Any]) -> list[str]:
-        """Take in the newest NodeStatus of each node; returns a line for each sensor that began or stopped."""
+    def look(self, nodes: Mapping[str, Any], *, ending: bool = False) -> list[str]:
+        """Take in the newest NodeStatus of each node; returns a line for each sensor that began or stopped.
+
+        While a flight is ``ending`` that a sensor stops is meant, and no line says so.
+        """
         now = self._clock()
         status = nodes.get(COUNTS)
         new, self._status = status is not self._status, status
@@ -109,7 +112,7 @@ class SensorWatch:
         lines, self._pending = self._pending, []
         for row in self.rows():
             before = self._states.get(row.name, NEVER)
-            if row.state != before:
+            if row.state != before and not (ending and row.state == STOPPED):
                 lines.append(f"{row.name} {row.words if row.state == STOPPED else row.state}")
             self._states[row.name] = row.state
         return lines

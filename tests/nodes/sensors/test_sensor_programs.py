@@ -378,7 +378,7 @@ def test_what_comes_in_and_what_is_missing():
     now = [0.0]
     watch = SensorWatch([("sensor/gnss",), ("sensor/imu", "sensor/attitude"), ("sensor/lines/N",)], lambda: now[0])
 
-    def look(seconds: float, **received: int) -> list[str]:
+    def look(seconds: float, ending: bool = False, **received: int) -> list[str]:
         lines = []
         for _ in range(round(seconds * 2)):
             now[0] += 0.5
@@ -392,9 +392,9 @@ def test_what_comes_in_and_what_is_missing():
                 for name, n in counted.items()
             ]  # fmt: skip
             status = SimpleNamespace(topics=topics)
-            lines += watch.look({"recorder": status})
+            lines += watch.look({"recorder": status}, ending=ending)
             now[0] += 0.2  # it looks more often than a status comes
-            lines += watch.look({"recorder": status})
+            lines += watch.look({"recorder": status}, ending=ending)
             now[0] -= 0.2
         return lines
 
@@ -413,6 +413,9 @@ def test_what_comes_in_and_what_is_missing():
     assert after["sensor/gnss"] == before["sensor/gnss"] + 8 and watch.never == ["sensor/lines/N"]
     watch.tell("gnss has ended: no such port")
     assert look(0.5, gnss=4) == ["gnss has ended: no such port"]
+    # what came just before the end is told, and not that all fall silent
+    assert look(8, ending=True, lines_N=10)[:1] == ["sensor/lines/N comes in"]
+    assert not any("stopped" in line for line in look(8, ending=True))
 
 
 def test_rates_are_those_that_the_recorder_measures():
