@@ -41,10 +41,10 @@ def read_sbet(
 ) -> NavigationTrack:
     """Poses of an SBET file. True heading is the platform heading less the wander angle.
 
-    Times are GPS seconds, or of UTC where the name of the file has ``UTC`` or ``UTCtime`` as a word, of the week or
-    of the day: ``seconds_of_day`` says which; None takes them as seconds of the day where all are below one day and
-    ``day`` is not a Sunday or Monday. ``accuracies`` is the SMRMSG file with the accuracies of the poses; None takes
-    the one beside the file under its name, if there is one.
+    Times are GPS seconds, or of UTC where the name of the file has ``UTC`` or ``UTCtime`` as a word that does not stand
+    behind a number, of the week or of the day: ``seconds_of_day`` says which; None takes them as seconds of the day
+    where all are below one day and ``day`` is not a Sunday or Monday. ``accuracies`` is the SMRMSG file with the
+    accuracies of the poses; None takes the one beside the file under its name, if there is one.
 
     Raises
     ------
@@ -64,9 +64,12 @@ def read_sbet(
             notes.append(f"{path.name}: times below one day, taken as seconds of {day}")
         elif day is not None and below and day.isoweekday() == 1:
             notes.append(f"{path.name}: times below one day; if they count from midnight, wanted --seconds-of-day")
-    utc = re.search(r"(?<![a-z])utc(time)?(?![a-z])", path.stem, re.IGNORECASE) is not None
-    if utc:
-        notes.append(f"{path.name}: times are taken as seconds of UTC, as its name says")
+    word = re.search(r"(?<![a-z])utc(time)?(?![a-z])", path.stem, re.IGNORECASE)
+    # in sbet_20211021_1200UTC it goes with a time of day
+    utc = word is not None and re.search(r"(?<![a-zA-Z0-9])\d+[-_ .]*$", path.stem[: word.start()]) is None
+    if word is not None:
+        scale = "of UTC, as its name says" if utc else "of GPS: UTC in its name goes with the number before it"
+        notes.append(f"{path.name}: times are taken as seconds {scale}")
     if datum := re.search(rf"(?<![a-z0-9])({_DATUMS})(?![0-9])", path.stem, re.IGNORECASE):
         notes.append(f"{path.name}: positions are taken as WGS 84, though its name says {datum[1]}")
     time = times_from_gps(path, column["time"], day, notes, of_day=of_day, utc=utc)

@@ -473,6 +473,8 @@ def test_sbet_over_the_end_of_a_week(tmp_path):
     [
         ("sbet--UTCtime-Lillehammer_211021.out", 0),
         ("Lillehammer-WGS84-UTC-10Hz.out", 0),
+        ("sbet_20211021_1200UTC.out", 18),
+        ("sbet_1200_UTC.out", 18),
         ("sbet_utc.out", 0),
         ("sbet_butcher.out", 18),
     ],
