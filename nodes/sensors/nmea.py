@@ -1,8 +1,9 @@
-"""NMEA 0183: GGA, RMC, ZDA, GST and HDT become ``sensor/gnss`` and, where it is wanted, ``sensor/attitude``.
+"""NMEA 0183: GGA or GNS, RMC, ZDA and GST become ``sensor/gnss``, PASHR and HDT ``sensor/attitude``.
 
-A fix goes out with its GGA. Its date is that of the last RMC or ZDA, its accuracy that of the last GST, which may come
-before it or after it; without GST, or with one of another quality, it follows from the quality and the HDOP of the GGA.
-Sentences are decoded by pynmeagps.
+A fix goes out with its GGA, or its GNS where no GGA comes. Its date is that of the last RMC or ZDA, its accuracy that
+of the last GST, which may come before it or after it; without GST, or with one of another quality, it follows from the
+quality and the HDOP of the fix. An attitude goes out with its PASHR, which has its own time and accuracy; headings of
+HDT, which have neither, only where they are wanted and no PASHR comes. Sentences are decoded by pynmeagps.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pynmeagps import GET, VALCKSUM, NMEAReader
 
-from ..convert import SECOND_NS, attitude_message, check_place, gnss_message
+from ..convert import SECOND_NS, attitude_message, check_angles, check_place, gnss_message
 from ..formats.course import MOST_CRAB_DEG, SLOW_M_S
 from ..formats.gps_time import WEEK_ROLLOVER
 from ..formats.keys import Keys
@@ -32,11 +33,16 @@ if TYPE_CHECKING:
     from ..bus.program import ProgramOptions
 
 KEYS = ("address", "baud", "date", "heading_sigma_deg", "level_sigma_deg", "velocity_sigma_m_s")
+Triple = tuple[float, float, float]
 #: Sentences that are read; others pass by.
-READ = ("GGA", "RMC", "ZDA", "GST", "HDT")
+READ = ("GGA", "GNS", "RMC", "ZDA", "GST", "HDT", "SHR")
 #: Horizontal sigma, m, at HDOP 1, by the quality of a GGA (SPS, DGPS, PPS, RTK fixed, RTK float, simulator); usual
 #: figures of such solutions. Heights are taken to be twice as poor.
 QUALITY_SIGMA_M = {1: 2.5, 2: 1.0, 3: 2.5, 4: 0.02, 5: 0.3, 8: 2.5}
+#: Sentences of Ashtech have a letter where the one with attitudes has a time.
+OTHER_SHR = tuple(b"$PASHR," + bytes([letter]) for letter in b"ABCDEFGHIJKLMNOPQRSTUVWXYZ")
+#: Quality of a GGA that says the same as a mode of a GNS; its other modes are no fix.
+GNS_QUALITY = {"R": 4, "F": 5, "P": 3, "D": 2, "A": 1, "S": 8}
 #: A GST holds for fixes of the same quality so long after it, s.
 GST_HOLDS_S = 5.0
 #: A vertical velocity that no sentence tells is taken as 0 with this sigma, m/s.
@@ -102,11 +108,13 @@ class NmeaParser:
         self._settings, self._problem = settings, problem
         self._rest = b""
         self._newest: datetime | None = None
-        self._last_ns = self._last_heading_ns = -1
-        self._earlier_ns: list[int] = []  # times of fixes that came one after another, before the newest one
-        self._epoch_ns = -1  # of the newest GGA or RMC
+        self._fixes, self._attitudes = _Forward(), _Forward()
+        self._last_heading_ns = -1
+        self._epoch_ns = -1  # of the newest fix or RMC
+        self._gga_comes = self._shr_comes = False  # so that GNS, and HDT, are not wanted
+        self._gns_ns = -1  # of the newest fix of a GNS
         self._stated: tuple[int, tuple[float, float, float]] | None = None  # sigmas, of a GST
-        self._quality = self._stated_quality = 0  # of the newest GGA, and of the one a GST is about
+        self._quality = self._stated_quality = 0  # of the newest fix, and of the one a GST is about
         self._motion: tuple[int, tuple[float, float]] | None = None  # east and north velocity, of an RMC
         self._few_told = False  # that fixes are rounded
         self._era_told = False  # that weeks count modulo 1024
@@ -130,10 +138,13 @@ class NmeaParser:
             return []
         line = line[start:]
         kind = line.split(b",", 1)[0][-3:].decode("ascii", "replace")
-        if kind not in READ:
+        if kind not in READ or line.startswith(OTHER_SHR):
             return []
         if b"*" not in line:
             self._problem("no checksum", _shown(line))
+            return []
+        if line.startswith(b"$PASHR,,"):  # before its alignment; no sentence to the library
+            self._problem("no attitude", "PASHR without time")
             return []
         try:
             sentence: Any = NMEAReader.parse(line + b"\r\n", msgmode=GET, validate=VALCKSUM)
@@ -143,7 +154,13 @@ class NmeaParser:
             return []
         try:
             return getattr(self, "_" + kind.lower())(sentence)
-        except (TypeError, ValueError, AttributeError, OverflowError):  # a field that is empty, no number or too large
+        except (
+            TypeError,
+            ValueError,
+            LookupError,
+            AttributeError,
+            OverflowError,
+        ):  # empty, no number, too large, missing
             self._problem("field missing", _shown(line))
             return []
 
@@ -160,7 +177,7 @@ class NmeaParser:
             if s.spd != "" and s.cog != "":
                 speed, course = _number(s.spd) * KNOT_M_S, np.radians(_number(s.cog))
                 self._motion = utc_ns, (float(speed * np.sin(course)), float(speed * np.cos(course)))
-                if self._settings.velocity_sigma_m_s and utc_ns == self._last_ns:  # the fix has gone out
+                if self._settings.velocity_sigma_m_s and utc_ns == self._fixes.newest_ns:  # the fix has gone out
                     self._problem("RMC after its GGA", "velocities go with fixes whose RMC comes before the GGA")
         return []
 
@@ -176,33 +193,48 @@ class NmeaParser:
         return []
 
     def _gga(self, s: Any) -> list[Message]:
-        quality = self._quality = int(s.quality)
-        if quality not in QUALITY_SIGMA_M:
-            self._problem("no fix", f"GGA of quality {quality}")
-            return []
-        if s.sep == "" or s.alt == "":
-            self._problem("no geoid separation", "GGA without height above the ellipsoid")
-            return []
-        _, latitude, north, longitude, east = s.payload[:5]
-        if north not in ("N", "S") or east not in ("E", "W") or "-" in latitude + longitude:
-            self._problem("no hemisphere", f"GGA at {latitude} {north}, {longitude} {east}, wanted N or S, and E or W")
-            return []
+        self._gga_comes = True
         units = s.altUnit, getattr(s, "sepUnit", "")
         if set(units) - {"M", ""}:
             self._problem("not in metres", f"GGA with heights in {' and '.join(units)}, wanted M")
             return []
+        return self._fix("GGA", s, int(s.quality), s.payload[10])
+
+    def _gns(self, s: Any) -> list[Message]:
+        if self._gga_comes:
+            return []
+        quality = next((quality for mode, quality in GNS_QUALITY.items() if mode in s.posMode), 0)
+        messages = self._fix("GNS", s, quality, s.payload[9])
+        if messages:
+            self._gns_ns = self._fixes.newest_ns
+        return messages
+
+    def _fix(self, name: str, s: Any, quality: int, separation: str) -> list[Message]:
+        """A fix from a sentence GGA or GNS, with its quality and its geoid separation as a text."""
+        self._quality = quality
+        if quality not in QUALITY_SIGMA_M:
+            self._problem("no fix", f"{name} of quality {quality}")
+            return []
+        if s.sep == "" or s.alt == "":
+            self._problem("no geoid separation", f"{name} without height above the ellipsoid")
+            return []
+        _, latitude, north, longitude, east = s.payload[:5]
+        if north not in ("N", "S") or east not in ("E", "W") or "-" in latitude + longitude:
+            what = f"{name} at {latitude} {north}, {longitude} {east}, wanted N or S, and E or W"
+            self._problem("no hemisphere", what)
+            return []
         utc_ns = self._utc(s.time)
         if utc_ns is None:
-            self._problem("no date yet", "GGA before the first RMC or ZDA; or give date")
+            self._problem("no date yet", f"{name} before the first RMC or ZDA; or give date")
             return []
-        if utc_ns <= self._last_ns and not self._goes_on_earlier(utc_ns):
-            self._problem("time does not go on", f"GGA of {s.time} does not come after the one before")
+        if not self._fixes.goes_on(utc_ns):
+            if utc_ns != self._gns_ns:  # the first GGA may come after a GNS
+                self._problem("time does not go on", f"{name} of {s.time} does not come after the one before")
             return []
-        self._earlier_ns.clear()
-        self._last_ns = self._epoch_ns = utc_ns
+        self._epoch_ns = utc_ns
         place = _number(s.lat), _number(s.lon), _number(s.alt) + _number(s.sep)
         check_place(*place)
-        sigma = self._as_written(self._sigma(utc_ns, quality, s.HDOP), s)
+        sigma = self._as_written(self._sigma(utc_ns, quality, s.HDOP), name, _rounding_m(s, separation))
         velocity: tuple[Any, ...] = ()
         if self._settings.velocity_sigma_m_s and self._motion is not None and self._motion[0] == utc_ns:
             level = self._settings.velocity_sigma_m_s
@@ -210,27 +242,54 @@ class NmeaParser:
         body = gnss_message(utc_ns, place, sigma, *velocity)
         return [Message("sensor/gnss", self._settings.clock.stamp(utc_ns), body)]
 
+    def _shr(self, s: Any) -> list[Message]:
+        """``PASHR,time,heading,T,roll,pitch,heave,sigmas of roll, pitch and heading,GNSS quality,IMU status``, in
+        degrees; right side down and nose up are positive with Applanix, NovAtel and SBG, who write it."""
+        self._shr_comes = True
+        fields = s.payload
+        if fields[2] != "T" or fields[10:11] == ["0"]:
+            what = "of an IMU that is out or not aligned" if fields[2] == "T" else "without true heading"
+            self._problem("no attitude", f"PASHR {what}")
+            return []
+        utc_ns = self._utc(s.utctime)
+        if utc_ns is None:
+            self._problem("no date yet", "PASHR before the first RMC or ZDA; or give date")
+            return []
+        if not self._attitudes.goes_on(utc_ns):
+            self._problem("time does not go on", f"PASHR of {s.utctime} does not come after the one before")
+            return []
+        heading, roll, pitch = (_number(fields[k]) for k in (1, 3, 4))
+        check_angles(*np.radians([roll, pitch, heading]))
+        stated = [_number(field) for field in fields[6:9]]
+        if min(stated) <= 0:
+            self._problem("no accuracy", f"PASHR with sigmas {', '.join(fields[6:9])} deg of roll, pitch and heading")
+            return []
+        self._compare_with_course("PASHR", heading, utc_ns)
+        rounding = [_last_figure(fields[k]) / math.sqrt(12.0) for k in (3, 4, 1)]
+        body = attitude_message(utc_ns, np.radians([roll, pitch, heading]), np.radians(np.hypot(stated, rounding)))
+        return [Message("sensor/attitude", self._settings.clock.stamp(utc_ns), body)]
+
     def _hdt(self, s: Any) -> list[Message]:
         heading_deg = _number(s.headingT)
         settings = self._settings
-        if not settings.heading_sigma_deg or self._epoch_ns == self._last_heading_ns:
+        if not settings.heading_sigma_deg or self._shr_comes or self._epoch_ns == self._last_heading_ns:
             return []
         self._last_heading_ns = self._epoch_ns
-        self._compare_with_course(heading_deg)
+        self._compare_with_course("HDT", heading_deg, self._epoch_ns)
         sigma = np.radians([settings.level_sigma_deg, settings.level_sigma_deg, settings.heading_sigma_deg])
         body = attitude_message(self._epoch_ns, np.radians([0.0, 0.0, heading_deg]), sigma)
         return [Message("sensor/attitude", settings.clock.stamp(self._epoch_ns), body)]
 
-    def _compare_with_course(self, heading_deg: float) -> None:
+    def _compare_with_course(self, name: str, heading_deg: float, time_ns: int) -> None:
         """Tell where the first headings of a fast flight lie off the course, as of antennas across the aircraft."""
-        if self._motion is None or abs(self._motion[0] - self._epoch_ns) > SECOND_NS or len(self._off_deg) == HEADINGS:
+        if self._motion is None or abs(self._motion[0] - time_ns) > SECOND_NS or len(self._off_deg) == HEADINGS:
             return
         east, north = self._motion[1]
         if math.hypot(east, north) > SLOW_M_S:
             off_deg = heading_deg - math.degrees(math.atan2(east, north))
             self._off_deg.append(abs((off_deg + 180.0) % 360.0 - 180.0))
         if len(self._off_deg) == HEADINGS and np.quantile(self._off_deg, 0.2) > MOST_CRAB_DEG:
-            what = f"HDT lies {np.median(self._off_deg):.0f} deg off the course of RMC (median of {HEADINGS})"
+            what = f"{name} lies {np.median(self._off_deg):.0f} deg off the course of RMC (median of {HEADINGS})"
             self._problem("heading off the course", f"{what}: are the antennas across the aircraft?")
 
     # ---- time and accuracy
@@ -261,15 +320,7 @@ class NmeaParser:
         utc_ns = round(whole.timestamp()) * SECOND_NS + near.microsecond * 1000
         return self._settings.clock.utc(utc_ns)
 
-    def _goes_on_earlier(self, utc_ns: int) -> bool:
-        """Whether so many fixes in a row go on from an earlier time that the newest one was wrong, or the clock was set
-        back."""
-        if self._earlier_ns and utc_ns <= self._earlier_ns[-1]:
-            self._earlier_ns.clear()
-        self._earlier_ns.append(utc_ns)
-        return len(self._earlier_ns) >= REBASE_AFTER
-
-    def _sigma(self, utc_ns: int, quality: int, hdop: Any) -> tuple[float, float, float]:
+    def _sigma(self, utc_ns: int, quality: int, hdop: Any) -> Triple:
         """East, north, up, m."""
         if self._stated is not None:
             age_ns, sigma = utc_ns - self._stated[0], self._stated[1]
@@ -280,23 +331,43 @@ class NmeaParser:
         level = QUALITY_SIGMA_M[quality] * max(_number(hdop or 1.0), 0.5)
         return level, level, 2.0 * level
 
-    def _as_written(self, sigma: tuple[float, float, float], s: Any) -> tuple[float, float, float]:
+    def _as_written(self, sigma: Triple, name: str, rounding: Triple) -> Triple:
         """Accuracy of a fix (east, north, up, m) with its rounding; that this is the larger part is told once."""
-        rounding = _rounding_m(s)
         lost, own = max(zip(rounding, sigma, strict=True), key=lambda both: both[0] / both[1])
         if lost > own and not self._few_told:
             self._few_told = True
-            what = f"GGA are rounded, which makes {lost:.3f} m (1 sigma) of a fix known to {own:.3f} m"
+            what = f"{name} are rounded, which makes {lost:.3f} m (1 sigma) of a fix known to {own:.3f} m"
             self._problem("few figures", f"{what}: let the receiver write more of them")
         east, north, up = (math.hypot(*both) for both in zip(sigma, rounding, strict=True))
         return east, north, up
 
 
-def _rounding_m(s: Any) -> tuple[float, float, float]:
-    """East, north, up, m: sigma of what a GGA lost where its figures end, a uniform error of half a unit at most."""
+class _Forward:
+    """Times of one kind of message, which go on."""
+
+    def __init__(self) -> None:
+        self.newest_ns = -1
+        self._earlier_ns: list[int] = []  # those that came one after another, before the newest one
+
+    def goes_on(self, utc_ns: int) -> bool:
+        """Whether a time comes after the one before, or is one of so many in a row that go on from an earlier time that
+        the newest one was wrong, or the clock was set back."""
+        if utc_ns <= self.newest_ns:
+            if self._earlier_ns and utc_ns <= self._earlier_ns[-1]:
+                self._earlier_ns.clear()
+            self._earlier_ns.append(utc_ns)
+            if len(self._earlier_ns) < REBASE_AFTER:
+                return False
+        self._earlier_ns.clear()
+        self.newest_ns = utc_ns
+        return True
+
+
+def _rounding_m(s: Any, separation: str) -> Triple:
+    """East, north, up, m: sigma of what a fix lost where its figures end, a uniform error of half a unit at most."""
     _, latitude, _, longitude, *_ = s.payload
     north, east = (_last_figure(field) * MINUTE_M / math.sqrt(12.0) for field in (latitude, longitude))
-    up = math.hypot(_last_figure(s.payload[8]), _last_figure(s.payload[10])) / math.sqrt(12.0)
+    up = math.hypot(_last_figure(s.payload[8]), _last_figure(separation)) / math.sqrt(12.0)
     return east * math.cos(math.radians(_number(s.lat))), north, up
 
 

@@ -333,11 +333,13 @@ def test_a_field_that_is_not_finite_is_counted(field):
         b"GNRMC,092750.00,A,5321.6802,N,00630.3372,W,120.00," + field + b",221126,,,A",
         b"GNGST,092750.20,0.9,0.03,0.02,10.0," + field + b",0.034,0.055",
         b"GNHDT," + field + b",T",
+        b"PASHR,092750.20,123.40,T,-0.83," + field + b",-0.01,0.029,0.024,0.059,2,1",
+        b"PASHR,092750.40,123.40,T,-0.83,+0.42,-0.01,0.029," + field + b",0.059,2,1",
         b"GNGGA,092750.20,5321.6802,N,00630.3372,W,4,12,0.6," + field + b",M,55.2,M,,",
         b"GNGGA,092750.40,5321.6802,N,00630.3372,W,4,12," + field + b",61.7,M,55.2,M,,",
     ):
         campaign.run("NMEA", body, lambda body=body: parser.feed(sentence_of(body)))
-    assert not found(campaign) and counts == ["field missing"] * 5
+    assert not found(campaign) and counts == ["field missing"] * 7
 
 
 @pytest.mark.parametrize("sigma", [1e150, 1e200, 1e-300])

@@ -319,3 +319,67 @@ def test_settings_that_cannot_be(tmp_path, table, wanted):
     with pytest.raises(UserError) as error:
         settings(tmp_path, **table)
     assert str(error.value).startswith(f"flight.toml: {wanted}") and "\n" not in str(error.value)
+
+
+def shr(clock: str, heading="312.95", flag="T", sigmas="0.029,0.024,0.059", status=",1") -> bytes:
+    """Of the form of a SPAN receiver of NovAtel: roll -0.83 deg, pitch +0.42 deg."""
+    return sentence(f"PASHR,{clock},{heading},{flag},-0.83,+0.42,-0.01,{sigmas},2{status}")
+
+
+@pytest.mark.parametrize("status", [",1", ""], ids=["with the status of the IMU", "older, without it"])
+def test_an_attitude_has_a_time_and_an_accuracy_of_its_own(tmp_path, status):
+    """And is used without being asked for; a heading of HDT is not wanted beside it."""
+    data = RMC + gga("092750.00") + shr("092750.02", status=status) + sentence("GPHDT,10.0,T")
+    (fix, attitude), counts = parse(tmp_path, data, heading_sigma_deg=0.2)
+    assert not counts and [fix.topic, attitude.topic] == ["sensor/gnss", "sensor/attitude"]
+    assert attitude.body.time_ns == attitude.stamp_ns == T0 + 20_000_000
+    angles = attitude.body.roll, attitude.body.pitch, attitude.body.heading
+    assert np.degrees(angles) == pytest.approx([-0.83, 0.42, 312.95], abs=1e-9)
+    step = 0.01 / np.sqrt(12.0)  # two decimals of a degree
+    sigmas = np.degrees(np.sqrt(attitude.body.covariance[::4]))
+    assert sigmas == pytest.approx(np.hypot([0.029, 0.024, 0.059], step), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "kind"),
+    [
+        (shr("092750.05", status=",0"), "no attitude"),  # before its alignment
+        (shr("092750.05", flag=""), "no attitude"),
+        (sentence("PASHR,,,,,,,,,,0,0"), "no attitude"),
+        (shr("092750.05", sigmas="0.000,0.000,0.000"), "no accuracy"),
+        (shr("092750.05", sigmas=",,"), "field missing"),
+        (shr("092750.00"), "time does not go on"),
+        (shr("092750.05", heading="812.95"), "field missing"),
+    ],
+)
+def test_attitudes_that_cannot_be_used_are_counted(tmp_path, wrong, kind):
+    messages, counts = parse(tmp_path, RMC + shr("092750.00") + wrong + shr("092750.10"))
+    assert counts == {kind: 1} and [message.topic for message in messages] == ["sensor/attitude"] * 2
+
+
+def test_other_sentences_of_ashtech_pass_by(tmp_path):
+    data = RMC + sentence("PASHR,ATT,304786.5,123.4,1.2,,0.01,0.02,0") + sentence("PASHR,NAK") + sentence("PASHR,XYZ,1")
+    assert parse(tmp_path, data) == ([], {})
+
+
+def gns(clock: str, mode: str) -> bytes:
+    return sentence(f"GNGNS,{clock},5321.6802000,N,00630.3372000,W,{mode},18,0.8,61.700,55.200,1.0,0000")
+
+
+def test_a_receiver_may_write_gns_in_place_of_gga(tmp_path):
+    data = RMC + gns("092750.00", "RRN") + gns("092750.20", "NN") + gns("092750.40", "AD")
+    (fixed, coarse), counts = parse(tmp_path, data)
+    assert counts == {"no fix": 1} and time_ns(coarse.body.timestamp) == T0 + 400_000_000
+    assert fixed.body.altitude == pytest.approx(61.7 + 55.2)
+    fixed_m2, coarse_m2 = (message.body.position_covariance[0] for message in (fixed, coarse))
+    (same,), _ = parse(tmp_path, RMC + gga("092750.00"))
+    assert fixed_m2 == same.body.position_covariance[0] and np.sqrt(coarse_m2) == pytest.approx(0.8, rel=1e-3)  # DGPS
+
+
+def test_with_both_gga_is_read(tmp_path):
+    seconds = [f"09275{k}.00" for k in range(3)]
+    data = RMC + b"".join(gns(clock, "RR") + gga(clock) for clock in seconds)
+    messages, counts = parse(tmp_path, data)
+    assert not counts and [time_ns(message.body.timestamp) for message in messages] == [
+        T0 + k * 10**9 for k in range(3)
+    ]
