@@ -28,6 +28,7 @@ import frame
 import numpy as np
 
 from triline.nodes.batch import rectification as work
+from triline.nodes.batch.strip_orientation import orientation_of
 from triline.nodes.cli import main as triline
 from triline.nodes.recording.access import Recording
 from triline.nodes.simulator.flight_settings import simulated_flight
@@ -140,10 +141,10 @@ def straightness(seed: int, folder: Path) -> dict[str, tuple[float, float, float
     recording = Recording(processed)
     camera = recording.camera()
     ccd = camera.line_index["N"]
-    frame = work.project_frame(recording)
+    frame = recording.frame()
     grid = GroundGrid(work.frame_for(frame, utm_of(frame)), round(ground_sample(flight), 2))
     field, rays = relief(flight), rays_of(camera, ccd)
-    _, true_orientation, reference_ns = work.orientation_of(recording, "truth")
+    _, true_orientation, reference_ns = orientation_of(recording, "truth")
     strip = recording.strips().iloc[0]
     line_ns = int(strip.first_line_time_ns) + np.arange(0, int(strip.lines), 5) * 1e9 / strip.line_rate_hz
 
@@ -157,7 +158,7 @@ def straightness(seed: int, folder: Path) -> dict[str, tuple[float, float, float
     truth = ground(true_orientation, reference_ns)
     result = {}
     for name in ("measured", "live", "final", "truth"):
-        _, orientation, reference_ns = work.orientation_of(recording, name)
+        _, orientation, reference_ns = orientation_of(recording, name)
         job = work.Rectification(camera, ccd, field, grid, "bilinear", lambda _, it=orientation: it, reference_ns)
         for block in work.line_blocks(recording, "N", None):
             job.add(block)

@@ -13,7 +13,6 @@ import users_day
 from places import ROOT
 
 import triline
-from triline.nodes.convert import local_frame
 from triline.schemas import topics
 from triline.solver.geometry.frames import navigation_from_R_lc
 from triline.solver.geometry.rotation import matrix_from_quaternion
@@ -58,7 +57,7 @@ def run(folder: Path, commands: list[str]) -> None:
 
 def orientation_error(recording, truth: users_day.Truth, topic: str):
     """RMS of X, Y, Z in m and of roll, pitch, heading in deg."""
-    frame, poses = local_frame(recording.project()), recording.poses(topic)
+    frame, poses = recording.frame(), recording.poses(topic)
     t = poses.time_ns * 1e-9 - users_day.START_S
     inside = (t > 0.2) & (t < truth.seconds - 0.2)
     position = poses.position_l[inside]

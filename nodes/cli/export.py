@@ -17,14 +17,7 @@ from ...solver.geometry.frames import LocalFrame
 from ...solver.geometry.rotation import matrix_from_quaternion
 from ...solver.geometry.trajectory import Trajectory
 from ..batch.point_table import write_points
-from ..batch.rectification import (
-    ORIENTATIONS,
-    REFINED,
-    camera_of_table,
-    estimated_camera,
-    lines_of_recording,
-    project_frame,
-)
+from ..batch.strip_orientation import ORIENTATIONS, REFINED, camera_of_table, estimated_camera, lines_of_recording
 from ..convert import PoseSample, R_bc_of, local_frame, pose_sample
 from ..errors import UserError, flag
 from ..formats.camera_json import write_camera
@@ -180,7 +173,7 @@ def _run_table(path: Path, args: argparse.Namespace) -> int:
             result |= {"of them live and never final": live} if live else {}
         else:
             name, lines, not_valid = lines_of_recording(recording, args.orientation)
-            frame, project = project_frame(recording), recording.project()
+            frame, project = recording.frame(), recording.project()
             refuse_missing_grids(frame.crs, path)
             result |= {"orientation": name, "lines": _write_lines(args.format, part, lines, frame, R_bc_of(project))}
             result |= {"poses left out, not valid": not_valid} if not_valid else {}

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from ...solver.orthoimage.ground_grid import GroundGrid
 from ...solver.orthoimage.resampling import TAPS
 from ...solver.rectification.kernels import TAPS as IMAGE_TAPS
-from ..batch.rectification import ORIENTATIONS, Rectification, Rectified, line_blocks, project_frame
+from ..batch.rectification import Rectification, Rectified, line_blocks
+from ..batch.strip_orientation import ORIENTATIONS
 from ..errors import UserError, flag
 from ..formats.geotiff import is_virtual, write_orthoimage
 from ..formats.importable import refuse_importable
@@ -134,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
         "sigma": args.sigma, "strips": done.strips, "left_out": done.left_out, "missed_rays": done.missed_rays,
         "hidden_cells": done.hidden_cells if args.occlusions else None,
         "poses_not_valid": of.orientation.not_valid,
-        "notes": [*of.notes, *notes_of_map(grid.frame.crs, project_frame(recording).crs)],
+        "notes": [*of.notes, *notes_of_map(grid.frame.crs, recording.frame().crs)],
         "seconds": round(time.perf_counter() - begun, 3),
     }  # fmt: skip
     _tell(result, done, args, grid.frame.units[0])

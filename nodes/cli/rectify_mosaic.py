@@ -35,7 +35,7 @@ from ..batch.mosaic_layers import (
     layer_of_mosaic,
     layer_of_orthoimage,
 )
-from ..batch.rectification import Rectification, line_blocks, project_frame
+from ..batch.rectification import Rectification, line_blocks
 from ..errors import UserError, flag
 from ..formats.geotiff import is_virtual
 from ..formats.height_raster import RasterFile
@@ -289,7 +289,7 @@ def _cells(args: argparse.Namespace, kinds: list[tuple[str, Path, str | None]]) 
 
 def _notes(kinds: list[tuple[str, Path, str | None]], crs: str) -> list[str]:
     """What is to be said of the CRS; finished orthoimages were made in it before."""
-    given = {"image": lambda _: "local", "recording": lambda path: project_frame(Recording(path)).crs}
+    given = {"image": lambda _: "local", "recording": lambda path: Recording(path).frame().crs}
     return list(dict.fromkeys(
         note for kind, path, _ in kinds if kind in given for note in notes_of_map(crs, given[kind](path))
     ))  # fmt: skip

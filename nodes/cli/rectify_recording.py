@@ -18,20 +18,9 @@ from ...solver.orthoimage.ground_grid import CellWindow, GroundGrid, metres_a_un
 from ...solver.orthoimage.orientation import LineOrientation
 from ...solver.orthoimage.surface import Ellipsoid, HeightField, Surface, UnderAir
 from ...solver.rectification.relief_shadows import ReliefShadows
-from ..batch.rectification import (
-    REFINED,
-    OfStrips,
-    OfTable,
-    camera_beside,
-    estimated_camera,
-    frame_for,
-    ground_of_points,
-    known_points,
-    line_blocks,
-    orientation_of,
-    pixel_on_ground,
-    project_frame,
-)
+from ..batch.rectification import frame_for, line_blocks, pixel_on_ground
+from ..batch.relief import ground_of_points, known_points
+from ..batch.strip_orientation import REFINED, OfStrips, OfTable, camera_beside, estimated_camera, orientation_of
 from ..config import raster_of_heights
 from ..errors import UserError
 from ..formats.camera_json import read_camera_instead
@@ -117,7 +106,7 @@ def prepared(args: argparse.Namespace, path: Path) -> Prepared:
         camera, of_camera = read_camera_instead(args.camera, camera, notes=notes), args.camera
     elif name in REFINED:
         camera, estimated = estimated_camera(recording, camera)
-    frame = project_frame(recording)
+    frame = recording.frame()
     target = frame_for(frame, args.crs or _crs(frame))
     surface, ground_m, ground = _ground(args, recording, frame)
     shadows = ReliefShadows(surface) if args.occlusions and isinstance(surface, HeightField) else None

@@ -17,7 +17,7 @@ from ...solver.simulation.orbital_scene import ORBITAL_SENSORS
 from ...solver.simulation.real_motion import RealMotion
 from ...solver.simulation.scenario import Simulation
 from .. import convert
-from ..batch.rectification import true_relief
+from ..batch.relief import true_relief
 from ..batch.simulated_scenes import SceneSimulation, simulated_recording, write_simulated_scenes
 from ..errors import UserError, flag
 from ..formats.geotiff import write_heights

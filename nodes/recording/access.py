@@ -19,6 +19,7 @@ from ...schemas import messages as m
 from ...schemas import topics
 from ...schemas.image_lines import LineBlock
 from ...solver.camera.line_camera import LineCamera
+from ...solver.geometry.frames import LocalFrame
 from .. import convert
 from ..errors import UserError
 from ..node import Message
@@ -156,6 +157,10 @@ class Recording:
     def project(self) -> Any:
         """The Project message, as it was stated last: frame, mounting, a-priori accuracies."""
         return self._last("configuration/project")
+
+    def frame(self) -> LocalFrame:
+        """The local frame of the project, with its CRS."""
+        return convert.local_frame(self.project())
 
     def true_world(self) -> str:
         """By what the world of a simulation differs from what is stated; "" where it does not, or is not known."""

@@ -10,7 +10,7 @@ import pytest
 from block_writer import write_block
 from small_block import FILES, simulated_block, write_files
 
-from triline.nodes.batch.rectification import OfTable, project_frame
+from triline.nodes.batch.strip_orientation import OfTable
 from triline.nodes.cli import main
 from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
@@ -97,7 +97,7 @@ def test_result_tables_are_read_as_input(flown, tmp_path):
     recording = Recording(folder / "b.mcap")
     table = OfTable(recording, tmp_path / "one.csv")
     position, _ = table.orientation.at((track.time_ns[[3]] - table.reference_ns) * 1e-9)
-    wanted = project_frame(recording).from_geodetic(*track.geodetic[3])
+    wanted = recording.frame().from_geodetic(*track.geodetic[3])
     np.testing.assert_allclose(position[0], wanted, atol=1e-3)
     write_block(tmp_path / "again", simulated_block(crs))
     plain = read_block(folder / "b")

@@ -13,7 +13,7 @@ import rasterio
 from recording_file import write_recording
 from test_adjust_command import AXES, write_block
 
-from triline.nodes.batch.rectification import OfTable, project_frame
+from triline.nodes.batch.strip_orientation import OfTable
 from triline.nodes.cli import main
 from triline.nodes.formats.camera_json import read_camera, write_camera
 from triline.nodes.formats.geotiff import Heights, write_heights
@@ -209,8 +209,8 @@ def test_orientation_of_recordings_adjusted_together_goes_back_to_each(tmp_path)
     for table in ("trajectory_refined.csv", "orientation_lines.csv"):
         assert set(pd.read_csv(tmp_path / "out" / table).strip) == {"S1@day1", "S1@day2"}
         for day, drawn in zip(days, ("day1.mcap", "drawn.mcap"), strict=True):
-            of, frame = OfTable(Recording(day), tmp_path / "out" / table), project_frame(Recording(day))
-            true, in_frame = Recording(day).poses("truth/trajectory"), project_frame(Recording(tmp_path / drawn))
+            of, frame = OfTable(Recording(day), tmp_path / "out" / table), Recording(day).frame()
+            true, in_frame = Recording(day).poses("truth/trajectory"), Recording(tmp_path / drawn).frame()
             time_s = (true.time_ns - of.reference_ns) * 1e-9
             inside = of.orientation.covers(time_s)
             position, _ = of.orientation.at(time_s[inside])

@@ -48,7 +48,7 @@ def navigated(folder: Path, messages: list[Message], capsys) -> tuple[float, lis
     notes = json.loads(capsys.readouterr().out)["notes"]
     rows = np.loadtxt(folder / "out" / "trajectory.csv", delimiter=",", skiprows=1)
     recording = Recording(path)
-    truth, frame = recording.poses("truth/trajectory"), convert.local_frame(recording.project())
+    truth, frame = recording.poses("truth/trajectory"), recording.frame()
     t = truth.time_ns * 1e-9
     inside = (t > rows[0, 0] + 20.0) & (t < rows[-1, 0])
     found = np.column_stack([np.interp(t[inside], rows[:, 0], x) for x in frame.from_geodetic(*rows[:, 1:4].T).T])

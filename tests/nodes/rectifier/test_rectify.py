@@ -22,6 +22,9 @@ from scipy import ndimage
 from synthetic_flight import flight_messages
 
 from triline.nodes.batch import rectification as work
+from triline.nodes.batch.relief import known_points
+from triline.nodes.batch.strip_orientation import OfTable, camera_beside, orientation_of
+from triline.nodes.batch.strip_orientation import estimated_camera as camera_estimated_in
 from triline.nodes.cli import main, rectify_mosaic
 from triline.nodes.convert import camera_from, camera_message, estimated_camera, ground_point_message, time_ns
 from triline.nodes.errors import UserError
@@ -154,14 +157,14 @@ def test_roads_become_straight(flown, simulated):
     flight = simulated.simulation.flight
     recording = Recording(flown)
     camera = recording.camera()
-    frame = work.frame_for(work.project_frame(recording), "EPSG:32632")
+    frame = work.frame_for(recording.frame(), "EPSG:32632")
     grid = GroundGrid(frame, round(ground_sample(flight), 2))
     low, high = flight.truth.position_l.min(axis=0) - 2000, flight.truth.position_l.max(axis=0) + 2000
     x, y = np.arange(low[0], high[0], 10.0), np.arange(low[1], high[1], 10.0)
     field = HeightField(x[0], y[0], 10.0, flight.terrain.height(*np.meshgrid(x, y)))
     off = {}
     for name in ("measured", "final", "truth"):
-        _, orientation, reference_ns = work.orientation_of(recording, name)
+        _, orientation, reference_ns = orientation_of(recording, name)
         job = work.Rectification(camera, 1, field, grid, "bilinear", lambda _, it=orientation: it, reference_ns)
         for block in work.line_blocks(recording, "N", None):
             job.add(block)
@@ -180,7 +183,7 @@ def test_orientation_of_an_adjustment_goes_with_the_camera_that_it_calibrated(fl
     command = ["adjust", flown, "--selfcal", "tls18", "--keep", "all", "-o", out, "--per-line", "-q"]
     assert main([*map(str, command)]) == 0
     camera = Recording(flown).camera()
-    found, path = work.camera_beside(out / "trajectory_refined.csv", camera)
+    found, path = camera_beside(out / "trajectory_refined.csv", camera)
     assert path == out / "camera.json"
     moved = [np.abs(a.xy_mm - b.xy_mm).max() for a, b in zip(found.lines, camera.lines, strict=True)]
     assert max(moved) > 1e-5
@@ -317,7 +320,7 @@ def test_parameters_of_other_things_than_the_camera_do_not_hide_those_of_the_cam
         report = m.AdjustmentReport(parameters=parameters)
         writer.write(Message("adjustment/report", message.stamp_ns + 1, report, "adjuster"))
     camera = Recording(path).camera()
-    found, n = work.estimated_camera(Recording(path), camera)
+    found, n = camera_estimated_in(Recording(path), camera)
     assert n == 2
     assert np.abs(found.lines[0].xy_mm - camera.lines[0].xy_mm).max() > 0.005
 
@@ -377,7 +380,7 @@ def test_cells_behind_walls_are_left_out(flown, simulated, dem, folder, capsys):
     """A forward look at walls and blocks: hidden is what rays marched from the ground to the camera find hidden."""
     raster = read_heights(dem)
     recording = Recording(flown)
-    _, orientation, reference_ns = work.orientation_of(recording, "truth")
+    _, orientation, reference_ns = orientation_of(recording, "truth")
     camera, strip = recording.camera(), next(iter(recording.last_strips().values()))
     ccd = camera.line_index["F"]
     first_s = (strip.first_line_time_ns - reference_ns) * 1e-9
@@ -837,7 +840,7 @@ def test_relief_is_of_points_with_a_height(tmp_path):
         for k, role in enumerate(("control", "planimetric", "height", "check")):
             body = ground_point_message(role, (10.0 * k, 0.0, 100.0 + k), np.eye(3), role)
             writer.write(Message("observation/control", k, body, "import"))
-    assert work.known_points(Recording(tmp_path / "control.mcap"))[:, 2].tolist() == [100.0, 102.0, 103.0]
+    assert known_points(Recording(tmp_path / "control.mcap"))[:, 2].tolist() == [100.0, 102.0, 103.0]
 
 
 def test_control_that_does_not_count_is_no_ground(tmp_path):
@@ -854,7 +857,7 @@ def test_control_that_does_not_count_is_no_ground(tmp_path):
         out = [m.RejectedObservation(point=name, coordinate="Z") for name in ("left out", "returned")]
         writer.write(Message("adjustment/report", 30, m.AdjustmentReport(rejected=out), "adjuster"))
         writer.write(Message("adjustment/report", 31, m.AdjustmentReport(returned=out[1:]), "adjuster"))
-    assert work.known_points(Recording(path))[:, 2].tolist() == [100.0, 102.0, 104.0]
+    assert known_points(Recording(path))[:, 2].tolist() == [100.0, 102.0, 104.0]
 
 
 def test_node_takes_no_height_of_control_that_an_operator_refused(flown):
@@ -1115,7 +1118,7 @@ def test_a_table_of_two_strips_gives_each_its_own_rows(tmp_path):
             for s, z in {"S1": 1000, "S2/L2": 1200, "": 900}.items()}  # fmt: skip
     table.write_text("\n".join([head, *rows["S1"], *rows["S2/L2"], *rows[""], ""]))
     recording = Recording(path)
-    found = work.OfTable(recording, table, lens="L2")
+    found = OfTable(recording, table, lens="L2")
     time_s = np.arange(10) / 10 + (start - found.reference_ns) * 1e-9
     for strip, height in {"S1": 1000.0, "S2": 1200.0}.items():
         of_strip = found(strip)
@@ -1123,19 +1126,19 @@ def test_a_table_of_two_strips_gives_each_its_own_rows(tmp_path):
         np.testing.assert_allclose(of_strip.at(time_s)[0][:, 2], height, atol=1e-6)
     assert found("S3") is None and found.missing == ["S3"]
     with pytest.raises(UserError, match=r"poses\.csv: strip: no rows of 'S3', there are: S1, S2/L2$"):
-        work.OfTable(recording, table, ["S3"], "L2")
+        OfTable(recording, table, ["S3"], "L2")
     table.write_text("\n".join([head, *(row.replace("S1,", "A,") for row in rows["S1"]), ""]))
     with pytest.raises(UserError, match=r"poses\.csv: strip: A, wanted one of those of .*two\.mcap: S1, S2, S3$"):
-        work.OfTable(recording, table)
+        OfTable(recording, table)
     bad = rows["S2/L2"][3].replace(",0,1200,", ",nothing,1200,")
     table.write_text("\n".join([head, *rows["S1"], *rows["S2/L2"][:3], bad, ""]))
     with pytest.raises(UserError, match=r"poses\.csv:15: Y_m: 'nothing' is not a number"):
-        work.OfTable(recording, table)
+        OfTable(recording, table)
     table.write_text(
         "\n".join([head, *rows["S1"], *rows["S2/L2"], rows["S2/L2"][2].replace(",0,1200,", ",5,1200,"), ""])
     )
     with pytest.raises(UserError, match=r"poses\.csv:22: time_s: .* comes twice with two poses"):
-        work.OfTable(recording, table, lens="L2")
+        OfTable(recording, table, lens="L2")
 
 
 def test_of_several_lenses_the_one_that_looks_down_is_rectified(tmp_path, capsys):

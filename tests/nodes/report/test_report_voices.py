@@ -12,7 +12,7 @@ import pytest
 from recording_file import write_recording
 from synthetic_flight import flight_messages
 
-from triline.nodes.batch.rectification import known_points
+from triline.nodes.batch.relief import known_points
 from triline.nodes.cli import main, view
 from triline.nodes.cli.damage import tell_other_camera
 from triline.nodes.convert import iso
