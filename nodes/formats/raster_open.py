@@ -37,11 +37,14 @@ def open_raster(path: Path, *, overviews: bool = True) -> Any:
     rasterio.errors.RasterioError : not there, or not a raster that can be read
     """
     import rasterio
-    from rasterio.errors import NotGeoreferencedWarning
+    from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
 
     with warnings.catch_warnings(), _without_undecodable_messages():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        return rasterio.open(path) if overviews else rasterio.open(path, OVERVIEW_LEVEL="NONE")
+        try:
+            return rasterio.open(path) if overviews else rasterio.open(path, OVERVIEW_LEVEL="NONE")
+        except UnicodeDecodeError:  # where rasterio would say what GDAL says, which names what the file names
+            raise RasterioIOError(f"{path}: names a file in bytes that are no UTF-8") from None
 
 
 def is_raster(path: Path) -> bool:
