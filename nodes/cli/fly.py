@@ -237,7 +237,7 @@ class Fly(LiveFlight):
         origin = self.flight.origin_deg or self.first.place
         if not self.first.newest_ns or origin is None:
             return
-        from ..formats.flight_folder import live_configuration
+        from ..formats.flight_messages import live_configuration
 
         self._configured = True
         for message in live_configuration(self.flight, origin, self.first.newest_ns + AHEAD_NS, SOURCE):

@@ -17,7 +17,8 @@ from ..formats.avirisc import LINE_RATE_HZ, avirisc_has_latitudes
 from ..formats.camera_json import write_camera
 from ..formats.detect import KINDS, Imported, Options, image_alone, kind_of_path, read_any
 from ..formats.envi_image import TYPES
-from ..formats.flight_folder import FILE, NAVIGATION, Instead, flight_messages
+from ..formats.flight_folder import FILE, NAVIGATION, Instead
+from ..formats.flight_messages import flight_messages
 from ..formats.geocal_xml import read_glas_camera, read_tie_points
 from ..formats.gpx import has_attitudes
 from ..formats.ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven

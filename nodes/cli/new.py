@@ -8,7 +8,7 @@ import shlex
 from pathlib import Path
 
 from ..errors import UserError
-from ..formats.flight_folder import write_template
+from ..formats.flight_template import write_template
 from ..formats.json_text import json_text
 from ..formats.new_file import refuse_unless_folder
 from ..formats.satellite.read import read_scene

@@ -1,21 +1,17 @@
-"""The flight folder: ``flight.toml`` names what a flight consists of, and the folder becomes a recording."""
+"""The flight folder: ``flight.toml`` names what a flight consists of; here it is read and checked."""
 
 from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import date
-from heapq import merge
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from ...schemas import messages as m
-from ...schemas.topics import rank
-from ...solver.adjustment.block_data import Apriori
 from ...solver.arrays import Array
 from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.sensors import PRESETS, preset
@@ -24,14 +20,12 @@ from ...solver.geometry.frames import CrsError, LocalFrame, known_crs, outside_a
 from ...solver.models import WANDER_SIGMAS, WANDER_TIMES
 from ...solver.navigation.inertial_data import MEMS, TACTICAL, InertialGrade
 from .. import config, registry
-from ..convert import camera_message, ground_point_message
 from ..errors import UserError
-from ..node import Message
 from .block_folder import read_ground_points
 from .block_messages import SIGMAS
 from .camera_json import read_camera
 from .dem import read_dem
-from .detect import KINDS, Imported, Options, kind_of_path, read_any, read_track, sensor_span, within
+from .detect import KINDS, Options, kind_of_path, read_any, read_track, sensor_span, within
 from .envi_image import TYPES
 from .geocal_xml import read_glas_camera
 from .ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
@@ -39,12 +33,11 @@ from .image_cubes import cubes_of, is_pattern
 from .image_lines import ImageStrip, LinesGiven, open_strips
 from .keys import Keys, is_there, read_toml
 from .line_time_files import times_beside
-from .new_file import new_file
 from .projection import missing_grids, off_without_grids, unknown_heights, with_heights
 from .sensor_folder import SensorFolder, read_grade, read_sensor_folder, refuse_mounting
 from .sensor_recording import sensor_extent, some
 from .time_columns import instant_ns
-from .track import Accuracy, Mounting, NavigationTrack
+from .track import Mounting, NavigationTrack
 
 FILE = "flight.toml"
 #: Control whose nearest point is farther from the flight, m, is in another CRS or of another flight.
@@ -325,115 +318,6 @@ def refuse_problems(flight: Flight) -> None:
         command = f"triline check {shlex.quote(str(flight.folder))}"
         others = f" (and {more} more: `{command}` names them)" if more else ""
         raise UserError(f"{flight.problems[0]}{others}")
-
-
-def live_configuration(flight: Flight, origin_deg: tuple[float, float], stamp_ns: int, source: str) -> list[Message]:
-    """Project, camera, control and announced strips of a live flight, all of them with one stamp.
-
-    Parameters
-    ----------
-    flight : read with ``live``, without problems
-    origin_deg : latitude and longitude of the local frame's origin; its height is that of the ground
-    stamp_ns : platform time from which they hold
-    source : name of the publisher
-    """
-    lat, lon = origin_deg
-    project = m.Project(
-        origin_latitude=lat, origin_longitude=lon, origin_height=flight.ground_height_m,
-        image_sigma_px=Apriori.image_sigma_px,
-    )  # fmt: skip
-    strips = [
-        m.Strip(id=id, first_line_time_ns=first_ns, line_rate_hz=rate_hz) for id, first_ns, rate_hz in flight.announced
-    ]
-    return [
-        *_configuration(flight, project, stamp_ns, source),
-        *(Message("configuration/strip", stamp_ns, strip, source) for strip in strips),
-    ]
-
-
-def flight_messages(folder: Path, instead: Instead | None = None) -> tuple[Imported, str]:
-    """The messages of a flight folder sorted by stamp and rank, and the name of its platform.
-
-    Parameters
-    ----------
-    folder : with a flight.toml
-    instead : data that are not those in the folder
-
-    Raises
-    ------
-    UserError : the first problem of the folder and the number of the others, or what a reader finds
-    """
-    flight = read_flight(folder, live=False, instead=instead)
-    refuse_problems(flight)
-    if flight.navigation is None or flight.camera is None:
-        raise UserError(f"{folder / FILE}: navigation or camera missing")
-    # what was asked of positions once is not asked again; those of tables of sensors are known to their reader only
-    asked = flight.track is None and flight.ground.stated
-    options = Options(
-        flight.day,
-        flight.crs,
-        flight.mounting,
-        camera=flight.camera if flight.kind == "ros2" else None,
-        accuracies=flight.accuracies,
-        lines=flight.lines,
-        accuracy=_accuracy(flight.sigmas),
-        ground=flight.ground if asked else GroundGiven(flight.ground_height_m),
-        poses_only=bool(flight.strips),
-        without_images=instead is not None and instead.files is not None,
-        grade=flight.grade,
-        folder=flight.tables,
-    )
-    imported = read_any(flight.navigation, flight.kind, options)
-    notes = imported.notes
-    notes[:] = [flight.in_keys(note) for note in notes if "--position-sigma" not in note]  # flight.toml has said them
-    notes[:0] = [*flight.notes, *(note for strip in flight.strips for note in strip.notes)]
-    return Imported("flight", _messages(flight, imported, notes), notes), flight.platform
-
-
-def _accuracy(sigmas: dict[str, Any]) -> Accuracy:
-    """Of poses that come without: all slow errors together."""
-
-    def total(*names: str) -> tuple[float, float, float]:
-        a, b, c = np.sqrt(np.sum([np.square(sigmas[name]) for name in names], axis=0)).tolist()
-        return a, b, c
-
-    position = total("offset_sigma_m", "wander_sigma_m")
-    return Accuracy(position, total("shift_sigma_deg", "drift_sigma_deg", "wander_sigma_deg"))
-
-
-def _messages(flight: Flight, imported: Imported, notes: list[str]) -> Iterator[Message]:
-    """Project, camera and control, then sensors or poses with the image lines among them."""
-    messages = (message for message in imported.messages if message.topic != "configuration/camera")
-    first = next(messages)
-    start = min([first.stamp_ns, *(int(strip.time_ns[0]) for strip in flight.strips)])
-    yield from _configuration(flight, first.body, start, first.source)
-    yield from merge(
-        messages,
-        *(strip.messages(notes) for strip in flight.strips),
-        key=lambda message: (message.stamp_ns, rank(message.topic)),
-    )
-
-
-def _configuration(flight: Flight, project: Any, start: int, source: str) -> Iterator[Message]:
-    """Project, camera and control; the project has its origin already."""
-    project.name, project.crs = flight.name, flight.crs
-    frame = LocalFrame(project.origin_latitude, project.origin_longitude, project.origin_height, flight.crs)
-    arm = np.asarray(flight.lever_arm_m) - np.asarray(flight.mounting.lever_arm_m)
-    for key, values in (("lever_arm_m", arm), ("boresight_deg", flight.mounting.boresight_deg), *flight.sigmas.items()):
-        if key in WANDER_TIMES:
-            setattr(project, key, values)
-            continue
-        del getattr(project, key)[:]
-        getattr(project, key).extend(float(v) for v in values)
-    yield Message("configuration/project", start, project, source)
-    if flight.camera is not None:
-        yield Message("configuration/camera", start, camera_message(flight.camera), source)
-    if flight.control is not None:
-        points, _ = read_ground_points(flight.control, flight.crs, frame, [])
-        columns = points.id, points.xyz_l, points.covariance, points.role, points.target_radius_m
-        for id, xyz, covariance, role, radius in zip(*columns, strict=True):
-            body = ground_point_message(id, xyz, covariance, role, radius)
-            yield Message("observation/control", start, body, source)
 
 
 def _general(flight: Flight, keys: Keys) -> None:
@@ -807,98 +691,3 @@ def _node(nodes: Keys, name: str) -> None:
             config.build(registry.node_class(name), {name: dict(table.values)})
         except UserError as error:
             raise UserError(f"{nodes.path}: nodes: {error}") from None
-
-
-TEMPLATE = """\
-# A flight for triline. Files are named relative to this folder. `triline check DIR` says what is missing,
-# `triline import DIR -o flight.mcap` makes a recording of it. Lines that begin with # are defaults or examples.
-
-[flight]
-name = "{name}"
-platform = "aircraft"             # first word of the topics on the bus
-crs = "EPSG:32632"                # horizontal CRS of control and results: anything that PROJ understands
-vertical_datum = "ellipsoid"      # "ellipsoid", or the vertical CRS of the heights, as "EPSG:5773" for EGM96
-#origin_deg = [47.9, 11.1]        # latitude, longitude of a live flight's local frame; else by control or GNSS
-#ground_height_m = 300.0          # height of the ground above the ellipsoid; or [dem], control, or:
-#above_ground_m = 1200.0          # so high the platform flies above the ground
-
-[camera]
-file = "camera.json"              # or: preset = "ads40"
-
-[mounting]                        # body axes forward, right, down
-lever_arm_m = [0.0, 0.0, 0.0]     # antenna, seen from the inertial sensor
-camera_lever_arm_m = [0.0, 0.0, 0.0]   # perspective centre, seen from the inertial sensor (or from what poses describe)
-boresight_deg = [0.0, 0.0, 0.0]   # roll, pitch, heading of the camera against the body
-
-[navigation]
-file = "navigation.csv"           # sensor folder, CSV, SBET, POS export, ROS 2 bag, imu_gps.txt, .lcf ...
-#accuracies = "smrmsg_7.out"      # of the poses of an SBET, where they are not beside it under its name
-#kind = "csv"                     # where the file does not show it: {kinds}
-#images = {{N = "/camera/nadir"}}   # topics of a ROS 2 bag whose images are image lines
-#date = 2024-05-17                # day of the flight, for files with GPS seconds of the week
-gnss = "code"                     # RTK, PPP or code: slow errors of the positions
-imu = "MEMS"                      # tactical or MEMS: slow errors of the attitudes, noise of the sensor
-
-#[trajectory]                     # slow errors left in the trajectory, in place of those of the grades; 1 sigma
-#offset_sigma_m = [1.0, 1.0, 2.0]             # constant over a strip
-#shift_sigma_deg = [0.05, 0.05, 0.15]
-#drift_sigma_deg = [0.02, 0.02, 0.05]         # over a strip
-#wander_sigma_m = [0.5, 0.5, 1.0]
-#wander_sigma_deg = [0.02, 0.02, 0.05]
-#wander_time_s = 60.0
-#attitude_wander_time_s = 60.0    # of the attitude's, where it is another one
-
-#[imu]                            # data sheet of the inertial sensor, in place of that of its grade
-#gyro_noise_deg_sqrt_h = 0.2
-#gyro_bias_deg_h = 20.0
-#accel_noise_m_s_sqrt_h = 0.05
-#accel_bias_mgal = 2000.0
-
-#[control]
-#file = "control.csv"             # point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m,role[,target_radius_m]
-
-#[dem]                            # heights of the ground, on which the origin of the local frame is put
-#file = "ground.tif"
-#crs = "EPSG:5773"                # what they count from, or "ellipsoid", where the file does not say
-#sigma_m = 0.5                    # with it the tie points lie on them: of a height at a place
-#shift_sigma_m = 0.5              # of the error that all heights share
-
-#[[strips]]                       # one for each strip
-#id = "S1"
-#images = {{F = "forward.img", N = "nadir.img", B = "backward.img"}}   # ENVI, TIFF, raw; "all.img@2" is band 2
-#type = "u2"                      # of raw files without header: u1, u2, >u2 (and samples = 1000)
-#line_times = "S1_times.csv"      # line,time; or:
-#first_time = 2024-05-17T09:30:00Z
-#line_rate_hz = 200.0
-#band = "1"                       # number, name, or sum as "2:0.5,3:0.5"
-#grey_range = [0.0, 1.0]          # values that become black and white
-
-#[[sensor]]                       # one for each sensor program that `triline fly` starts
-#kind = "nmea"                    # nmea, lines, ros2 or stream
-#id = "gnss"
-#address = "serial:/dev/ttyUSB0"  # or tcp://HOST:PORT, udp://HOST:PORT, file:NAME
-#clock_offset_s = 0.0             # its stamps minus UTC
-#delay_s = 0.0                    # from the measurement until it is here
-
-#[nodes.matcher]                  # settings of nodes: triline process --config DIR/flight.toml
-#image_sigma_px = 0.04            # floor of the sigma of a match, px
-"""
-
-
-def write_template(folder: Path) -> Path:
-    """Write a commented flight.toml into a folder, which is made where it is not there.
-
-    Raises
-    ------
-    UserError : there is one already, or the folder cannot be made
-    """
-    path = folder / FILE
-    if path.exists():
-        raise UserError(f"{path}: is there already, and is not overwritten")
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"{folder}: is a file, wanted a folder")
-    folder.mkdir(parents=True, exist_ok=True)
-    name = folder.resolve().name.replace("\\", "").replace('"', "")
-    with new_file(path) as part:
-        part.write_text(TEMPLATE.format(name=name, kinds=", ".join(NAVIGATION)), encoding="utf-8")
-    return path

@@ -14,7 +14,8 @@ from triline.nodes.cli import main
 from triline.nodes.convert import pose_sample
 from triline.nodes.errors import UserError
 from triline.nodes.formats.detect import Options, read_any
-from triline.nodes.formats.flight_folder import read_flight, write_template
+from triline.nodes.formats.flight_folder import read_flight
+from triline.nodes.formats.flight_template import write_template
 from triline.nodes.formats.gps_time import gps_from_utc_ns
 from triline.nodes.formats.sbet import read_sbet
 from triline.nodes.formats.smrmsg import beside, write_smrmsg

@@ -17,7 +17,8 @@ from triline.nodes.cli import fly, main, parse
 from triline.nodes.cli.fly import FirstData
 from triline.nodes.cli.node import _value
 from triline.nodes.convert import gnss_message
-from triline.nodes.formats.flight_folder import live_configuration, read_flight
+from triline.nodes.formats.flight_folder import read_flight
+from triline.nodes.formats.flight_messages import live_configuration
 from triline.nodes.monitor.sensor_watch import SensorWatch
 from triline.nodes.sensors import line_camera
 from triline.nodes.sensors.settings import read_sensors
