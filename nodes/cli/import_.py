@@ -44,7 +44,7 @@ _POSES = ("lever_arm", "boresight", "position_sigma", "attitude_sigma", *_SENSOR
 GO_WITH: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("flight", "ties", "camera"), ()),
     **dict.fromkeys(("sensors", "rtklib", "ros2"), _SENSORS),
-    **dict.fromkeys(("avirisng", "pos", "headwall", "resonon", "gpx"), _POSES),
+    **dict.fromkeys(("avirisng", "pos", "waypoint", "headwall", "resonon", "gpx"), _POSES),
     **dict.fromkeys(("avirisc", "csv"), (*_POSES, "crs")),
     "sbet": (*_POSES, "seconds_of_day", "accuracies"),
     **dict.fromkeys(("block", "scenes"), _IMAGES),

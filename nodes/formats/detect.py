@@ -47,6 +47,7 @@ from .time_columns import same_day
 from .track import Accuracy, Mounting, NavigationTrack, frame_of, track_messages
 from .trajectory_csv import is_trajectory_csv, read_trajectory_csv
 from .vendor_poses import is_headwall, is_resonon, read_headwall, read_resonon
+from .waypoint import is_waypoint, read_waypoint
 
 #: Times before this one, ns, are GPS seconds of the week whose day nobody has said.
 _NO_DAY_NS = (GPS_EPOCH_S + 2 * WEEK_S) * SECOND_NS
@@ -59,6 +60,7 @@ KINDS = {
     "avirisng": "AVIRIS-NG line-by-line poses (angYYYYMMDDtHHMMSS_eph_att)",
     "avirisc": "AVIRIS-C ephemeris (fYYMMDDtNNpNNrNN..._eph)",
     "pos": "Applanix POS Export text",
+    "waypoint": "text of Inertial Explorer (NovAtel Waypoint)",
     "sbet": "SBET",
     "csv": "trajectory as CSV",
     "headwall": "Headwall poses (imu_gps.txt)",
@@ -165,6 +167,8 @@ def kind_of_path(path: Path) -> str:
         return kind
     if is_pos_export(path):
         return "pos"
+    if is_waypoint(path):
+        return "waypoint"
     if is_rtklib(path):
         return "rtklib"
     if is_headwall(path):
@@ -187,7 +191,7 @@ def kind_of_path(path: Path) -> str:
 
 
 def read_track(path: Path, kind: str, options: Options) -> NavigationTrack:
-    """The poses in a file of one of the kinds avirisng, avirisc, pos, sbet, csv, headwall, resonon, gpx.
+    """The poses in a file of one of the kinds avirisng, avirisc, pos, waypoint, sbet, csv, headwall, resonon, gpx.
 
     Raises
     ------
@@ -199,6 +203,8 @@ def read_track(path: Path, kind: str, options: Options) -> NavigationTrack:
         return read_avirisc(path, options.crs, options.line_rate_hz, options.day)
     if kind == "pos":
         return read_pos_export(path, options.day)
+    if kind == "waypoint":
+        return read_waypoint(path, options.day)
     if kind == "sbet":
         return read_sbet(path, options.day, seconds_of_day=options.seconds_of_day, accuracies=options.accuracies)
     if kind == "headwall":

@@ -50,7 +50,7 @@ LONGEST_CRS = 60
 #: Images of a strip that are named where they are missing.
 MISSING_SHOWN = 3
 #: What `navigation.file` may be.
-NAVIGATION = ("sensors", "ros2", "avirisng", "avirisc", "pos", "sbet", "csv", "headwall", "resonon", "gpx")
+NAVIGATION = ("sensors", "ros2", "avirisng", "avirisc", "pos", "waypoint", "sbet", "csv", "headwall", "resonon", "gpx")
 #: Slow errors of positions by kind of GNSS solution, m: constant in a strip, and wandering (east, north, up), and the
 #: correlation time, s. Usual figures of such solutions, to be replaced by what is known of the own one.
 POSITION_ERRORS = {

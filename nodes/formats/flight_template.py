@@ -30,7 +30,7 @@ camera_lever_arm_m = [0.0, 0.0, 0.0]   # perspective centre, seen from the inert
 boresight_deg = [0.0, 0.0, 0.0]   # roll, pitch, heading of the camera against the body
 
 [navigation]
-file = "navigation.csv"           # sensor folder, CSV, SBET, POS export, ROS 2 bag, imu_gps.txt, .lcf ...
+file = "navigation.csv"           # sensor folder, CSV, SBET, POS export, Inertial Explorer, ROS 2 bag, imu_gps.txt ...
 #accuracies = "smrmsg_7.out"      # of the poses of an SBET, where they are not beside it under its name
 #kind = "csv"                     # where the file does not show it: {kinds}
 #images = {{N = "/camera/nadir"}}   # topics of a ROS 2 bag whose images are image lines

@@ -64,8 +64,8 @@ def other_kind(path: Path) -> str | None:
         )
     if re.search(rb"Program:\s+(Inertial Explorer|GrafNav)", head):
         return (
-            "text of Inertial Explorer or GrafNav; wanted its SBET, or its table as CSV below the header "
-            "week,sow_s,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg (GPS time, H-Ell)"
+            "text of Inertial Explorer or GrafNav without a row of names (Latitude, Longitude, H-Ell, Roll, Pitch, "
+            "Heading, Week, GPSTime) and a row of their units; wanted an export with both"
         )
     if name in PARTS:
         return f"{PARTS[name]}, which is given as a whole"

@@ -173,6 +173,13 @@ def numbered_lines(path: Path) -> list[tuple[int, str]]:
 
 def numbers_of(path: Path, lines: list[tuple[int, list[str]]], place: dict[str, int]) -> NDArray[np.float64]:
     """Values (n, columns) of the columns at their places."""
+    at = tuple(place.values())
+    try:
+        values = np.array([[float(fields[i]) for i in at] for _, fields in lines])
+        if len(values) > 1 and np.isfinite(values).all():
+            return values
+    except (ValueError, IndexError):
+        pass  # told below, which takes four times as long
     rows, problems = [], []
     for number, fields in lines:
         row = []

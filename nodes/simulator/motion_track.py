@@ -21,7 +21,7 @@ POSE_TOPICS = (
     *("trajectory/smoothed", "trajectory/filtered"),
 )
 #: Kinds of files with poses.
-TRACKS = ("avirisng", "avirisc", "pos", "sbet", "csv", "headwall", "resonon", "gpx")
+TRACKS = ("avirisng", "avirisc", "pos", "waypoint", "sbet", "csv", "headwall", "resonon", "gpx")
 
 
 def motion_of(

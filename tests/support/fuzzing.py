@@ -388,6 +388,7 @@ OTHERS = {
     "ang20170323t202244_eph_att": "AVIRIS-NG poses",
     "f180522t01p00r07rdn_e_lonlat_eph": "AVIRIS-C poses",
     "pos.txt": "POS export",
+    "explorer.txt": "Inertial Explorer poses",
     "camera.xml": "GLAS camera",
     "ties.xml": "GeoCal tie points",
     "imu_gps.txt": "Headwall poses",

@@ -11,6 +11,7 @@ from small_block import FILES, write_files
 from test_gpx import HEAD, attitude, point
 from test_imports import write_sbet_file
 from test_ros2 import flight_of, write_bag
+from tracks import straight_track, waypoint_text
 
 from triline.nodes.errors import UserError
 from triline.nodes.formats.block_folder import read_block
@@ -53,6 +54,10 @@ def small_files(folder: Path) -> dict[str, bytes]:
         "sbet.out": write_sbet_file(folder).read_bytes(),
         "poses.csv": (csv + "".join(f"{i},48.{i},11,500,0,0,45\n" for i in range(20))).encode(),
     }
+    columns = ("Week (weeks)", "GPSTime (sec)", "Latitude (+/-D M S)", "Longitude (+/-D M S)", "H-Ell (m)")
+    found["explorer.txt"] = waypoint_text(
+        straight_track(), *columns, "Roll (deg)", "Pitch (deg)", "Heading (deg)"
+    ).encode()
     gpx = "".join(point(i, attitude(i)) for i in range(20))
     found["track.gpx"] = f"{HEAD}{gpx}</trkseg></trk></gpx>".encode()
     found["ros.mcap"] = (write_bag(folder / "bag", flight_of()) / "bag.mcap").read_bytes()
@@ -88,6 +93,7 @@ def samples(tmp_path_factory):
 _NAMES = [
     "sbet.out",
     "poses.csv",
+    "explorer.txt",
     "track.gpx",
     "ros.mcap",
     "ang20170323t202244_eph_att",

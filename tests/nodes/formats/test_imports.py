@@ -421,7 +421,10 @@ def test_foreign_files_get_one_line(tmp_path, capsys):
     ("head", "wanted"),
     [
         ("$GNGGA,092750.20,5321.6802,N,00630.3372,W,4,18,0.8,61.7,M,55.2,M,,*5E\n", 'kind = "nmea" in a flight.toml'),
-        ("Project:     x\nProgram:     Inertial Explorer Version 8.90.6611\n", "week,sow_s,lat_deg,lon_deg,height_m,"),
+        (
+            "Project:     x\nProgram:     Inertial Explorer Version 8.90.6611\n",
+            "without a row of names (Latitude, Longitude, H-Ell,",
+        ),
         ("Project:     x\n\nProgram:     GrafNav Version 9.00.2207\n", "text of Inertial Explorer or GrafNav"),
     ],
 )

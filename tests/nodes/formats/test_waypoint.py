@@ -1,0 +1,151 @@
+"""Text of Inertial Explorer: whatever columns the user has chosen, the poses are the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import date
+
+import numpy as np
+import pytest
+from tracks import straight_track, waypoint_text
+
+from triline.nodes.cli import main
+from triline.nodes.errors import UserError
+from triline.nodes.formats.detect import kind_of_path
+from triline.nodes.formats.waypoint import read_waypoint
+from triline.nodes.recording.access import Recording
+
+HEADER = """
+Project:     valley
+Program:     Inertial Explorer Version 8.90.6611
+Profile:     survey
+Source:      GNSS/INS Epochs(Smoothed TC Combined)
+
+Datum:       WGS84, (processing datum)
+Master 1:    Name BASE, Status ENABLED
+             Position 48 00 42.83213, 11 33 24.98087, 496.009 m (WGS84, Ellipsoidal hgt)
+UTC Offset:  18 s
+
+"""
+ANGLES = ("Heading (deg)", "HdngSep (deg)", "Pitch (deg)", "Roll (deg)", "AmbStatus", "Q")
+DMS = ("Latitude (+/-D M S)", "Longitude (+/-D M S)", "H-Ell (m)")
+DEGREES = ("Longitude (deg)", "Latitude (deg)", "H-Ell (m)")
+
+
+def written(tmp_path, *columns, track=None, header=HEADER):
+    path = tmp_path / "flight.txt"
+    path.write_text(waypoint_text(track or straight_track(), *columns, header=header))
+    return path
+
+
+def check(found, track) -> None:
+    np.testing.assert_allclose(found.time_ns, track.time_ns, atol=1_000_000)
+    np.testing.assert_allclose(found.geodetic, track.geodetic, atol=1e-8)
+    np.testing.assert_allclose(found.rpy, track.rpy, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        ("Week (weeks)", "GPSTime (sec)", *DMS, "VNorth (m/s)", *ANGLES),
+        ("UTCTime (sec)", "Week (weeks)", "GPSTime (sec)", *DEGREES, *ANGLES),
+        ("GPSTime (sec)", "Date (YMD)", *DMS, *ANGLES),
+        ("UTCDate (MDY)", "UTCTime (HMS)", *DEGREES, *ANGLES),
+        ("UTCDate (MDY)", "UTCTime (sec)", *DMS, "X-ECEF (m)", *ANGLES),
+    ],
+    ids=["week", "with UTC beside it", "date", "UTC as a clock", "UTC as seconds"],
+)
+@pytest.mark.parametrize("header", [HEADER, ""], ids=["header", "names alone"])
+def test_columns_in_any_order_and_unit(tmp_path, columns, header):
+    path = written(tmp_path, *columns, header=header)
+    assert kind_of_path(path) == "waypoint"
+    track = read_waypoint(path)
+    check(track, straight_track())
+    assert not track.notes and not track.has_accuracies
+
+
+def test_a_flight_in_the_south_and_west_at_0_degrees(tmp_path):
+    """-0 degrees 30 minutes is half a degree to the south."""
+    track = straight_track()
+    track = replace(track, geodetic=track.geodetic - [48.5, 11.5, 0.0])
+    path = written(tmp_path, "Week (weeks)", "GPSTime (sec)", *DMS, *ANGLES, track=track)
+    assert " -0 29 " in path.read_text()
+    check(read_waypoint(path), track)
+
+
+def test_separated_by_commas_with_remarks_behind(tmp_path):
+    columns = ("Week (weeks)", "GPSTime (sec)", *DMS, *ANGLES)
+    rows = waypoint_text(straight_track(), *columns).splitlines()
+    names, units = (",".join(part) for part in zip(*((*c.split(" ", 1), "")[:2] for c in columns), strict=True))
+    path = tmp_path / "flight.txt"
+    text = [names, units, *(",".join(row.split()) for row in rows[2:]), "", "Footer: end of the table"]
+    path.write_bytes(b"\xef\xbb\xbf" + "\r\n".join(text).encode())
+    check(read_waypoint(path), straight_track())
+
+
+def test_the_day_is_asked_for_where_no_column_says_it(tmp_path):
+    path = written(tmp_path, "GPSTime (sec)", *DMS, *ANGLES)
+    assert "(--date)" in read_waypoint(path).notes[0]
+    check(read_waypoint(path, date(2020, 6, 1)), straight_track())
+    clock = written(tmp_path, "UTCTime (HMS)", *DMS, *ANGLES)
+    check(read_waypoint(clock, date(2020, 6, 1)), straight_track())
+
+
+def test_accuracies_have_their_units(tmp_path):
+    more = ("SDEast (m)", "SDNorth (m)", "SDHeight (m)", "RollSD (arcmin)", "PitchSD (arcmin)", "HdngSD (deg)")
+    path = written(tmp_path, "Week (weeks)", "GPSTime (sec)", *DMS, *ANGLES[:4], *more)
+    lines = path.read_text().splitlines()
+    sigmas = " 0.02 0.01 0.03 0.3 0.6 0.02"
+    path.write_text("\n".join([*lines[:-50], *(line[: -6 * 21] + sigmas for line in lines[-50:])]))
+    track = read_waypoint(path)
+    np.testing.assert_allclose(track.sigma_ned_m[0], [0.01, 0.02, 0.03])
+    np.testing.assert_allclose(np.degrees(track.sigma_rpy[0]), [0.005, 0.01, 0.02])
+    path.write_text(path.read_text().replace("SDNorth", "CNorth "))
+    track = read_waypoint(path)
+    assert track.sigma_ned_m is None and "accuracies are not complete and not used" in track.notes[0]
+
+
+def test_another_datum_and_rotations_are_told(tmp_path):
+    header = HEADER.replace("WGS84, (pro", "NAD83(2011), (pro").replace(
+        "UTC Offset", "Body to Sensor Rotations:\n  xRot=0.000, yRot=0.000, zRot=-90.000 degrees (Rotate)\nUTC Offset"
+    )
+    notes = read_waypoint(written(tmp_path, "Week (weeks)", "GPSTime (sec)", *DMS, *ANGLES, header=header)).notes
+    assert notes[0] == "flight.txt: datum NAD83, taken as WGS 84"
+    assert "rotations applied by Inertial Explorer: xRot=0.000, yRot=0.000, zRot=-90.000 degrees" in notes[1]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "wanted"),
+    [
+        ("H-Ell", "H-MSL", r":12: H-Ell: column missing, .* \(H-MSL counts from a geoid\)"),
+        ("Heading", "COG    ", ":12: Heading: column missing"),
+        ("GPSTime", "Time   ", ":12: GPSTime: column missing, wanted it with Week, or UTCTime with UTCDate"),
+        (" (m)", "(ft)", ":13: H-Ell: in ft, wanted m"),
+        ("(sec)", "( ms)", ":13: GPSTime: in ms, wanted sec or HMS"),
+        ("2000.000", "2000.0x0", r":14: H-Ell: '2000.0x0' is not a number"),
+        ("2108.00000", "     week21", r":14: Week: 'week21', wanted a GPS week"),
+        ("48 00 00.00000", "48 00", r":14: 14 values, wanted 15"),
+        ("Latitude", "Lat     ", "no row of names with Latitude and Longitude"),
+    ],
+)
+def test_what_is_wrong_is_told_with_its_line(tmp_path, old, new, wanted):
+    path = written(tmp_path, "Week (weeks)", "GPSTime (sec)", *DMS, *ANGLES)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(UserError, match=wanted):
+        read_waypoint(path)
+
+
+def test_another_day_than_the_one_given_is_refused(tmp_path):
+    path = written(tmp_path, "Week (weeks)", "GPSTime (sec)", *DMS, *ANGLES)
+    check(read_waypoint(path, date(2020, 6, 2)), straight_track())
+    with pytest.raises(UserError, match="--date 2020-06-08, but its times begin on 2020-06-01"):
+        read_waypoint(path, date(2020, 6, 8))
+
+
+def test_it_is_imported_as_any_file_of_poses(tmp_path, capsys):
+    path = written(tmp_path, "Week (weeks)", "GPSTime (sec)", *DMS, *ANGLES)
+    assert main(["import", str(path), "-o", str(tmp_path / "flight.mcap")]) == 0
+    assert "text of Inertial Explorer" in capsys.readouterr().out
+    assert len(Recording(tmp_path / "flight.mcap").poses("trajectory/smoothed").time_ns) == 50
