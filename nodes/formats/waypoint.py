@@ -105,7 +105,7 @@ def read_waypoint(path: Path, day: date | None = None) -> NavigationTrack:
         raise UserError(f"{path}: no row of names with Latitude and Longitude and a row of their units below it")
     names_at = lines[at][0]
     rows = [(number, _words(text)) for number, text in lines[at + 2 :]]
-    while rows and not re.match(r"[-+.\d]", rows[-1][1][0]):  # remarks behind the table
+    while rows and not re.match(r"[-+.\d]", "".join(rows[-1][1])):  # remarks behind the table
         rows.pop()
     columns, total = _columns(lines[at][1], lines[at + 1][1], rows[0][1] if rows else [])
     found = {quantity: c for quantity, names in _NAMES.items() for c in columns if _plain(c.name) in names}
@@ -228,10 +228,9 @@ def _times(
     own = _own_day(path, rows, found, None if utc or clock else seconds)
     if own is not None and day is not None and abs((own - day).days) > 1:  # they may differ by a night
         raise UserError(f"{path}: --date {day}, but its times begin on {own}; wanted the same day, or no --date")
-    day = own or day
-    # UTC and dates go with seconds of the day, or of the week; on a Sunday these are the same
-    of_day = clock or (day is not None and "week" not in found and seconds.max() < DAY_S and gps_week(day)[1] > 0)
-    return times_from_gps(path, seconds, day, notes, of_day=of_day, utc=utc)
+    # beside a date seconds count from midnight or from Sunday, where these differ
+    of_day = clock or (own is not None and "week" not in found and seconds.max() < DAY_S and gps_week(own)[1] > 0)
+    return times_from_gps(path, seconds, own or day, notes, of_day=of_day, utc=utc)
 
 
 def _seconds_of_day(path: Path, rows: _Rows, column: _Column) -> Array:

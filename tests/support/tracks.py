@@ -47,6 +47,7 @@ def waypoint_text(track: NavigationTrack, *columns: str, header: str = "") -> st
     cells = {
         "Week (weeks)": [f"{week}.00000"] * len(track),
         "GPSTime (sec)": [f"{s:.3f}" for s in gps_s],
+        "GPSTime (s of day)": [f"{s % 86_400:.3f}" for s in gps_s],
         "UTCTime (sec)": [f"{s:.3f}" for s in utc_s],
         "UTCTime (HMS)": [_clock(s) for s in utc_s],
         "UTCDate (MDY)": [f"{t:%m/%d/%Y}" for t in day],
@@ -61,6 +62,7 @@ def waypoint_text(track: NavigationTrack, *columns: str, header: str = "") -> st
         "Heading (deg)": [f"{v:.9f}" for v in heading],
     }
     names, units = zip(*(c.split(" ", 1) if "(" in c else (c, "") for c in columns), strict=True)
+    units = ["(sec)" if unit == "(s of day)" else unit for unit in units]
     rows = [[cells.get(c, ["0"] * len(track))[i] for c in columns] for i in range(len(track))]
     table = [names, units, *rows]
     return header + "\n".join(" ".join(f"{cell:>20}" for cell in row) for row in table) + "\n"

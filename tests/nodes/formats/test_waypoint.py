@@ -52,8 +52,9 @@ def check(found, track) -> None:
         ("GPSTime (sec)", "Date (YMD)", *DMS, *ANGLES),
         ("UTCDate (MDY)", "UTCTime (HMS)", *DEGREES, *ANGLES),
         ("UTCDate (MDY)", "UTCTime (sec)", *DMS, "X-ECEF (m)", *ANGLES),
+        ("Date (YMD)", "GPSTime (s of day)", *DMS, *ANGLES),
     ],
-    ids=["week", "with UTC beside it", "date", "UTC as a clock", "UTC as seconds"],
+    ids=["week", "with UTC beside it", "date", "UTC as a clock", "UTC as seconds", "seconds of the day"],
 )
 @pytest.mark.parametrize("header", [HEADER, ""], ids=["header", "names alone"])
 def test_columns_in_any_order_and_unit(tmp_path, columns, header):
@@ -78,7 +79,7 @@ def test_separated_by_commas_with_remarks_behind(tmp_path):
     rows = waypoint_text(straight_track(), *columns).splitlines()
     names, units = (",".join(part) for part in zip(*((*c.split(" ", 1), "")[:2] for c in columns), strict=True))
     path = tmp_path / "flight.txt"
-    text = [names, units, *(",".join(row.split()) for row in rows[2:]), "", "Footer: end of the table"]
+    text = [names, units, *(",".join(row.split()) for row in rows[2:]), "", ",,,", "Footer: end of the table"]
     path.write_bytes(b"\xef\xbb\xbf" + "\r\n".join(text).encode())
     check(read_waypoint(path), straight_track())
 
@@ -149,3 +150,11 @@ def test_it_is_imported_as_any_file_of_poses(tmp_path, capsys):
     assert main(["import", str(path), "-o", str(tmp_path / "flight.mcap")]) == 0
     assert "text of Inertial Explorer" in capsys.readouterr().out
     assert len(Recording(tmp_path / "flight.mcap").poses("trajectory/smoothed").time_ns) == 50
+
+
+def test_a_sunday_night_is_none_of_the_monday_that_is_given(tmp_path):
+    """The day that somebody gives may be off by a night: seconds of the week do not become those of it."""
+    track = straight_track()
+    sunday = replace(track, time_ns=track.time_ns - 13 * 3600 * 10**9)  # 2020-05-31, 23:00
+    path = written(tmp_path, "GPSTime (sec)", *DMS, *ANGLES, track=sunday)
+    check(read_waypoint(path, date(2020, 6, 1)), sunday)
