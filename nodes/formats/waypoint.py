@@ -1,7 +1,8 @@
 """Text of NovAtel's Waypoint programs (Inertial Explorer): a header in words, names of columns, their units, pose rows.
 
-Which columns there are, in what order and in what units, the user chooses when he exports. Angles are those of other
-navigation files: roll positive with the right side down, pitch with the nose up, heading clockwise from north.
+Which columns there are, in what order and in what units, the user chooses when he exports. Angles are taken as those of
+other navigation files: roll positive with the right side down, pitch with the nose up, heading clockwise from north.
+Poses that contradict this by their course and turns are noted, as of any file.
 """
 
 from __future__ import annotations

@@ -244,7 +244,7 @@ class NmeaParser:
 
     def _shr(self, s: Any) -> list[Message]:
         """``PASHR,time,heading,T,roll,pitch,heave,sigmas of roll, pitch and heading,GNSS quality,IMU status``, in
-        degrees; right side down and nose up are positive with Applanix, NovAtel and SBG, who write it."""
+        degrees. Right side down and nose up are taken as positive, as ArduPilot writes it; manuals do not say."""
         self._shr_comes = True
         fields = s.payload
         if fields[2] != "T" or fields[10:11] == ["0"]:
