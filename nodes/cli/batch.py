@@ -144,6 +144,9 @@ def _options(given: Sequence[str], wanted: Sequence[str]) -> dict[str, tuple[str
         named = getattr(args, "recording", getattr(args, "input", None))
         if [str(path) for path in (named if isinstance(named, list) else [named])] != ["recording.mcap"]:
             raise UserError(f"--with '{name} {' '.join(words)}': names another input")
+        config = getattr(args, "config", None)
+        if config is not None and not config.is_file():  # each job would fail of it, one after the other
+            raise UserError(f"--with '{name} {' '.join(words)}': {config}: no such file")
     return found
 
 

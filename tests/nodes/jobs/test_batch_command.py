@@ -290,6 +290,7 @@ def test_two_batches_do_not_write_to_one_folder(season, capsys):
         (("--with", "adjust --snoop"), "wanted one of the steps first: process, analyze"),
         (("--with", "process -o x.mcap"), "-o is set by `triline batch`"),
         (("--with", "process 'x"), "no closing quotation"),
+        (("--list", "--with", "process --config no.toml"), "--with 'process --config no.toml': no.toml: no such file"),
     ],
 )
 def test_bad_options_are_one_line(season, capsys, words, told):
