@@ -21,6 +21,7 @@ from ..errors import UserError
 from .gps_time import DAY_S, WEEK_S, gps_week
 from .plausible import check_units
 from .table import MOST_PROBLEMS, one_line
+from .time_columns import same_day
 from .track import NavigationTrack, checked, times_from_gps
 from .vendor_poses import numbered_lines, numbers_of
 
@@ -61,8 +62,9 @@ _METRES = ("height", "sd_n", "sd_e", "sd_u", "sd_level")
 _ANGLES = ("lat", "lon", "roll", "pitch", "heading", "sd_roll", "sd_pitch", "sd_heading")
 #: Unit of an angle of one number -> degrees.
 _DEGREES = {"deg": 1.0, "arcmin": 1.0 / 60.0, "arcsec": 1.0 / 3600.0, "rad": 180.0 / np.pi}
-#: Unit of an angle of several numbers -> how many: degrees, minutes, seconds.
+#: Unit of an angle of several numbers -> how many of these.
 _SPLIT = {"dms": 3, "dm": 2}
+_PARTS = ("", " (minutes)", " (seconds)")
 #: Order of day, month and year, as the unit of a date says it.
 _DATES = {"mdy": "%m/%d/%Y", "dmy": "%d/%m/%Y", "ymd": "%Y/%m/%d"}
 #: A table begins within so many lines.
@@ -185,13 +187,13 @@ def _values(path: Path, names_at: int, rows: _Rows, found: dict[str, _Column]) -
     place: dict[str, int] = {}
     for quantity, column in found.items():
         if quantity in _ANGLES or quantity in _METRES:
-            place |= {f"{column.name}{' ' * k}": column.first + k for k in range(column.words)}
+            place |= {column.name + _PARTS[k]: column.first + k for k in range(column.words)}
     numbers = dict(zip(place, numbers_of(path, rows, place).T, strict=True))
     out: dict[str, Array] = {}
     for quantity, column in found.items():
-        if f"{column.name}" not in numbers:
+        if column.name not in numbers:
             continue
-        parts = [numbers[f"{column.name}{' ' * k}"] for k in range(column.words)]
+        parts = [numbers[column.name + part] for part in _PARTS[: column.words]]
         size = sum(np.abs(part) / 60.0**k for k, part in enumerate(parts))
         out[quantity] = np.copysign(size, parts[0]) * _DEGREES.get(column.unit, 1.0)
     return out
@@ -227,11 +229,12 @@ def _times(
     else:
         raise UserError(f"{path}:{names_at + 1}: {column.name}: in {column.unit or 'no unit'}, wanted sec or HMS")
     own = _own_day(path, rows, found, None if utc or clock else seconds)
-    if own is not None and day is not None and abs((own - day).days) > 1:  # they may differ by a night
-        raise UserError(f"{path}: --date {day}, but its times begin on {own}; wanted the same day, or no --date")
     # beside a date seconds count from midnight or from Sunday, where these differ
     of_day = clock or (own is not None and "week" not in found and seconds.max() < DAY_S and gps_week(own)[1] > 0)
-    return times_from_gps(path, seconds, own or day, notes, of_day=of_day, utc=utc)
+    time_ns = times_from_gps(path, seconds, own or day, notes, of_day=of_day, utc=utc)
+    if own is not None:
+        same_day(path, int(time_ns[0]), day)
+    return time_ns
 
 
 def _seconds_of_day(path: Path, rows: _Rows, column: _Column) -> Array:

@@ -154,13 +154,8 @@ class NmeaParser:
             return []
         try:
             return getattr(self, "_" + kind.lower())(sentence)
-        except (
-            TypeError,
-            ValueError,
-            LookupError,
-            AttributeError,
-            OverflowError,
-        ):  # empty, no number, too large, missing
+        # a field that is missing, empty, no number or too large
+        except (TypeError, ValueError, LookupError, AttributeError, OverflowError):
             self._problem("field missing", _shown(line))
             return []
 
@@ -245,7 +240,6 @@ class NmeaParser:
     def _shr(self, s: Any) -> list[Message]:
         """``PASHR,time,heading,T,roll,pitch,heave,sigmas of roll, pitch and heading,GNSS quality,IMU status``, in
         degrees. Right side down and nose up are taken as positive, as ArduPilot writes it; manuals do not say."""
-        self._shr_comes = True
         fields = s.payload
         if fields[2] != "T" or fields[10:11] == ["0"]:
             what = "of an IMU that is out or not aligned" if fields[2] == "T" else "without true heading"
@@ -264,6 +258,7 @@ class NmeaParser:
         if min(stated) <= 0:
             self._problem("no accuracy", f"PASHR with sigmas {', '.join(fields[6:9])} deg of roll, pitch and heading")
             return []
+        self._shr_comes = True
         self._compare_with_course("PASHR", heading, utc_ns)
         rounding = [_last_figure(fields[k]) / math.sqrt(12.0) for k in (3, 4, 1)]
         body = attitude_message(utc_ns, np.radians([roll, pitch, heading]), np.radians(np.hypot(stated, rounding)))

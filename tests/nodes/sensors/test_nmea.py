@@ -357,6 +357,12 @@ def test_attitudes_that_cannot_be_used_are_counted(tmp_path, wrong, kind):
     assert counts == {kind: 1} and [message.topic for message in messages] == ["sensor/attitude"] * 2
 
 
+def test_a_heading_of_hdt_counts_while_pashr_has_no_alignment(tmp_path):
+    data = RMC + gga("092750.00") + shr("092750.02", status=",0") + sentence("GPHDT,10.0,T")
+    (_, heading), counts = parse(tmp_path, data, heading_sigma_deg=0.2)
+    assert counts == {"no attitude": 1} and np.degrees(heading.body.heading) == pytest.approx(10.0)
+
+
 def test_other_sentences_of_ashtech_pass_by(tmp_path):
     data = RMC + sentence("PASHR,ATT,304786.5,123.4,1.2,,0.01,0.02,0") + sentence("PASHR,NAK") + sentence("PASHR,XYZ,1")
     assert parse(tmp_path, data) == ([], {})
