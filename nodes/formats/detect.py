@@ -268,8 +268,7 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
     else:
         track = read_track(path, kind, options)
         notes.extend(track.notes)
-        if not track.has_accuracies:
-            notes.extend(_assumed(path, options.accuracy))
+        notes.extend(_assumed(path, track, options.accuracy))
         usual_s = float(np.median(np.diff(track.time_ns))) * 1e-9
         if usual_s > POSE_GAP_S:
             what = f"more than {POSE_GAP_S:g} s between two are a gap without orientation for 'process'"
@@ -289,20 +288,22 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
     return Imported(kind, messages, notes)
 
 
-def _assumed(path: Path, accuracy: Accuracy) -> list[str]:
-    """A note about accuracies of poses that neither the file nor the user states."""
+def _assumed(path: Path, track: NavigationTrack, accuracy: Accuracy) -> list[str]:
+    """A note about accuracies of positions and attitudes that neither the file gives nor the user states."""
+    positions, attitudes = track.has_position_sigmas, track.has_attitude_sigmas
     assumed = [
-        (f"{values[0]:g} and {values[2]:g} {unit}", option)
-        for values, unit, option, stated in (
-            (accuracy.position_m, "m", "--position-sigma", accuracy.position_stated),
-            (accuracy.attitude_deg, "deg", "--attitude-sigma", accuracy.attitude_stated),
+        (f"{values[0]:g} and {values[2]:g} {unit}", option, what)
+        for values, unit, option, what, known in (
+            (accuracy.position_m, "m", "--position-sigma", "positions", positions or accuracy.position_stated),
+            (accuracy.attitude_deg, "deg", "--attitude-sigma", "attitudes", attitudes or accuracy.attitude_stated),
         )
-        if not stated
+        if not known
     ]
     if not assumed:
         return []
-    values, options = (", ".join(column) for column in zip(*assumed, strict=True))
-    return [f"{path.name}: no accuracies of the poses: {values} taken ({options})"]
+    values, options, which = (", ".join(column) for column in zip(*assumed, strict=True))
+    what = which if positions or attitudes else "poses"
+    return [f"{path.name}: no accuracies of the {what}: {values} taken ({options})"]
 
 
 def _image_topics(options: Options) -> ImageTopics:

@@ -67,14 +67,14 @@ def read_pos_export(path: Path, day: date | None = None) -> NavigationTrack:
         said = re.search(rf"{what} values:((?:\s*\w+\s*=\s*{_NUMBER}[^,.]*[,.]?){{3}})", head)
         if said and any(float(v) for v in re.findall(rf"=\s*{_NUMBER}", said.group(1))):
             notes.append(f"{path.name}: {what.lower()} applied by POS Export: {said.group(1).strip()}")
-    has_sigma = all(name in names for name in _SIGMAS)
+    has_position, has_attitude = (all(name in names for name in three) for three in (_SIGMAS[:3], _SIGMAS[3:]))
     track = NavigationTrack(
         path.stem,
         times_from_gps(path, column["TIME"], day, notes),
         np.column_stack([lat, lon, column["ELLIPSOID HEIGHT"]]),
         np.radians(np.column_stack([column["ROLL"], column["PITCH"], column["HEADING"]])),
-        np.column_stack([column[name] for name in _SIGMAS[:3]]) if has_sigma else None,
-        np.radians(np.column_stack([column[name] for name in _SIGMAS[3:]])) if has_sigma else None,
+        np.column_stack([column[name] for name in _SIGMAS[:3]]) if has_position else None,
+        np.radians(np.column_stack([column[name] for name in _SIGMAS[3:]])) if has_attitude else None,
         notes=tuple(notes),
     )
     return checked(track, path)

@@ -77,17 +77,14 @@ class Accuracy:
         """(6, 6) of a pose."""
         return np.diag(np.concatenate([self.position_m, np.radians(self.attitude_deg)])) ** 2
 
-    def of_poses(self, covariance: Array | None, n: int) -> Array:
-        """(n, 6, 6) of n poses whose file gives covariances (n, 6, 6), or None; what is stated takes their place, and
-        all of this that of those which are not known (NaN)."""
-        if covariance is None:
-            return np.broadcast_to(self.covariance, (n, 6, 6))
+    def of_poses(self, covariance: Array) -> Array:
+        """Covariances (n, 6, 6) of poses, with those of this for positions and attitudes that are stated or that the
+        file does not know (NaN)."""
         out = covariance.copy()
-        out[~np.isfinite(covariance).all(axis=(1, 2))] = self.covariance
         for part, stated in ((slice(0, 3), self.position_stated), (slice(3, 6), self.attitude_stated)):
-            if stated:
-                out[:, part, :] = out[:, :, part] = 0.0
-                out[:, part, part] = self.covariance[part, part]
+            these = stated | ~np.isfinite(out[:, part, part]).all(axis=(1, 2))
+            out[these, part, :] = out[these, :, part] = 0.0
+            out[these, part, part] = self.covariance[part, part]
         return out
 
 
@@ -101,9 +98,9 @@ class NavigationTrack:
     time_ns : (n,) UTC, rising
     geodetic : (n, 3) latitude and longitude in degrees (WGS 84), height in metres
     rpy : (n, 3) roll, pitch, heading against true north, radians
-    sigma_ned_m, sigma_rpy : (n, 3) or None; metres, radians
-    covariance_n : (n, 6, 6) or None, in their place: of the position along north, east and down, m, and of a small turn
-        about them, radians; NaN where it is not known
+    sigma_ned_m, sigma_rpy : (n, 3), each or None; metres, radians
+    covariance_n : (n, 6, 6) or None, in their place: of the position along north, east and down, m, and, independent
+        of it, of a small turn about them, radians; NaN where either is not known
     line_rate_hz : image lines a second where each pose belongs to an image line, 0 otherwise
     notes : remarks of the reader
     """
@@ -122,9 +119,18 @@ class NavigationTrack:
         return len(self.time_ns)
 
     @property
-    def has_accuracies(self) -> bool:
-        """Whether the file says how good its poses are."""
-        return self.covariance_n is not None or (self.sigma_ned_m is not None and self.sigma_rpy is not None)
+    def has_position_sigmas(self) -> bool:
+        """Whether the file says how good its positions are."""
+        if self.covariance_n is not None:
+            return bool(np.isfinite(self.covariance_n[:, 0, 0]).any())
+        return self.sigma_ned_m is not None
+
+    @property
+    def has_attitude_sigmas(self) -> bool:
+        """Whether the file says how good its attitudes are."""
+        if self.covariance_n is not None:
+            return bool(np.isfinite(self.covariance_n[:, 3, 3]).any())
+        return self.sigma_rpy is not None
 
 
 def checked(track: NavigationTrack, path: Path, rows: NDArray[np.intp] | None = None) -> NavigationTrack:
@@ -251,23 +257,25 @@ def frame_of(track: NavigationTrack) -> LocalFrame:
 
 def camera_poses(
     track: NavigationTrack, frame: LocalFrame, mounting: Mounting = Mounting()
-) -> tuple[Array, Array, Array | None]:
-    """Perspective centres (n, 3), rotations image to local (n, 3, 3), and covariances (n, 6, 6) or None."""
+) -> tuple[Array, Array, Array]:
+    """Perspective centres (n, 3), rotations image to local (n, 3, 3), covariances (n, 6, 6), NaN where not known."""
     body_l = frame.from_geodetic(*track.geodetic.T)
     R_ln = frame.R_ln(body_l)
     R_nb = matrix_from_navigation(*track.rpy.T)
     position = body_l + np.einsum("nij,njk,k->ni", R_ln, R_nb, np.asarray(mounting.lever_arm_m))
     R_lc = R_lc_from_navigation(frame, body_l, track.rpy, mounting.R_bc)
-    if track.covariance_n is not None:
-        T = np.zeros((len(track), 6, 6))
-        T[:, :3, :3], T[:, 3:, 3:] = R_ln, angles_jacobian(angles_from_matrix(R_lc)) @ R_ln
-        return position, R_lc, T @ track.covariance_n @ np.swapaxes(T, 1, 2)
-    if track.sigma_ned_m is None or track.sigma_rpy is None:
-        return position, R_lc, None
     covariance = np.zeros((len(track), 6, 6))
-    covariance[:, :3, :3] = R_ln @ (np.square(track.sigma_ned_m)[:, :, None] * np.swapaxes(R_ln, -1, -2))
-    cov_rpy = np.square(track.sigma_rpy)[:, :, None] * np.eye(3)
-    covariance[:, 3:, 3:] = opk_covariance_from_navigation(track.rpy, R_lc, R_ln, cov_rpy)
+    if track.covariance_n is not None:
+        angles_of_turn = angles_jacobian(angles_from_matrix(R_lc)) @ R_ln
+        for part, T in ((slice(0, 3), R_ln), (slice(3, 6), angles_of_turn)):
+            covariance[:, part, part] = T @ track.covariance_n[:, part, part] @ np.swapaxes(T, 1, 2)
+        return position, R_lc, covariance
+    covariance[:, :3, :3] = covariance[:, 3:, 3:] = np.nan
+    if track.sigma_ned_m is not None:
+        covariance[:, :3, :3] = R_ln @ (np.square(track.sigma_ned_m)[:, :, None] * np.swapaxes(R_ln, -1, -2))
+    if track.sigma_rpy is not None:
+        cov_rpy = np.square(track.sigma_rpy)[:, :, None] * np.eye(3)
+        covariance[:, 3:, 3:] = opk_covariance_from_navigation(track.rpy, R_lc, R_ln, cov_rpy)
     return position, R_lc, covariance
 
 
@@ -286,7 +294,7 @@ def track_messages(
     frame = frame_of(track) if frame is None else frame
     start = int(track.time_ns[0])
     position, R_lc, covariance = camera_poses(track, frame, mounting)
-    covariance = accuracy.of_poses(covariance, len(track))
+    covariance = accuracy.of_poses(covariance)
     sigma = np.sqrt(np.median(np.einsum("nii->ni", covariance), axis=0))
     attitude_deg = np.degrees(sigma[3:]).tolist()
     project = m.Project(

@@ -102,9 +102,10 @@ def _track_table(path: Path, crs: str | None, notes: list[str], *more: Column) -
     sigmas = _sigmas_of(header)
     columns += [Column(name, low=0.0, blank=photogrammetric) for name in sigmas if name in header]
     table = read_table(path, [*columns, *more], notes)
-    missing = [name for name in sigmas if name not in table]
-    if 0 < len(missing) < len(sigmas):
-        notes.append(f"{path.name}: no column {', '.join(missing)}: the other sigmas do not count")
+    for some, of in ((sigmas[:3], "position"), (sigmas[3:], "attitude")):
+        missing = [name for name in some if name not in table]
+        if 0 < len(missing) < len(some):
+            notes.append(f"{path.name}: no column {', '.join(missing)}: the other sigmas of the {of} do not count")
     return table
 
 
@@ -113,7 +114,6 @@ def _track(table: Table, crs: str | None, day: date | None, notes: list[str]) ->
     path, time, photogrammetric = table.path, time_columns(table.values), _is_photogrammetric(table.values)
     names = {} if photogrammetric else _columns(path, list(table.values))
     sigmas = _sigmas_of(table.values)
-    given = all(name in table for name in sigmas)
     time_ns = times_of(table, time, day, notes)
     late = np.concatenate([[False], np.diff(time_ns) <= 0])
     seconds = time_ns * 1e-9
@@ -128,8 +128,8 @@ def _track(table: Table, crs: str | None, day: date | None, notes: list[str]) ->
             notes.append(f"{path.name}: {names['height']} is taken as height above the ellipsoid (WGS 84)")
         rpy = np.radians(np.column_stack([_in_degrees(table, names[q]) for q in ("roll", "pitch", "heading")]))
         covariance = None
-        sigma_m = table.stack(*sigmas[:3]) if given else None
-        sigma_rpy = np.radians(table.stack(*sigmas[3:])) if given else None
+        sigma_m = table.stack(*sigmas[:3]) if all(name in table for name in sigmas[:3]) else None
+        sigma_rpy = np.radians(table.stack(*sigmas[3:])) if all(name in table for name in sigmas[3:]) else None
     track = NavigationTrack(
         path.stem, time_ns, geodetic, rpy, sigma_m, sigma_rpy, notes=tuple(notes), covariance_n=covariance
     )
@@ -259,7 +259,7 @@ def _sigmas_of(header: Collection[str]) -> tuple[str, ...]:
     """Names of columns with sigmas, as far as a table has them."""
     if _is_photogrammetric(header):
         return _XYZ_OPK
-    return (*_NED, *_RPY) if set(_NED) <= set(header) else tuple(f"{name}_sigma" for name in _NAVIGATION)
+    return (*_NED, *_RPY) if {*_NED, *_RPY} & set(header) else tuple(f"{name}_sigma" for name in _NAVIGATION)
 
 
 def _is_photogrammetric(header: Collection[str]) -> bool:
@@ -303,10 +303,8 @@ def _in_degrees(table: Table, name: str) -> np.ndarray:
     return np.degrees(values)
 
 
-def _from_crs(
-    path: Path, table: Table, crs: str | None, notes: list[str]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Latitude, longitude and height (n, 3), roll, pitch and heading (n, 3), and covariances as of a track, or None."""
+def _from_crs(path: Path, table: Table, crs: str | None, notes: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Latitude, longitude and height (n, 3), roll, pitch and heading (n, 3), and covariances as of a track."""
     xyz, angles = table.stack(*PLACE), np.radians(table.stack(*_OPK))
     if not crs or crs == "local":
         for name in PLACE:
@@ -328,20 +326,23 @@ def _from_crs(
         frame.to_geodetic(position),
         navigation_from_R_lc(frame, position, R_l_crs @ matrix_from_angles(*angles.T)),
     )
-    if not all(name in table for name in _XYZ_OPK):
-        return geodetic, rpy, None
-    sigma = table.stack(*_XYZ_OPK)
-    unknown = np.isnan(sigma).any(axis=1)
-    if unknown.all():
-        return geodetic, rpy, None
+    R_n_crs = np.swapaxes(frame.R_ln(position), 1, 2) @ R_l_crs
+    covariance = np.zeros((len(xyz), 6, 6))
+    unknown = np.zeros(len(xyz), dtype=bool)
+    for part, unit, T in (
+        (slice(0, 3), 1.0, R_n_crs),
+        (slice(3, 6), np.pi / 180.0, R_n_crs @ np.linalg.inv(angles_jacobian(angles))),
+    ):
+        names = _XYZ_OPK[part]
+        sigma = table.stack(*names) * unit if all(name in table for name in names) else np.full((len(xyz), 3), np.nan)
+        covariance[:, part, part] = T @ (np.square(sigma)[:, :, None] * np.swapaxes(T, 1, 2))
+        lacks = np.isnan(sigma).any(axis=1)
+        covariance[lacks, part, part] = np.nan
+        unknown |= lacks & ~lacks.all()
     if unknown.any():
         what = "they get the accuracies of poses that have none (--position-sigma, --attitude-sigma)"
         notes.append(f"{path.name}: {int(unknown.sum())} poses without sigmas: {what}")
-    R_n_crs = np.swapaxes(frame.R_ln(position), 1, 2) @ R_l_crs
-    T = np.zeros((len(xyz), 6, 6))
-    T[:, :3, :3], T[:, 3:, 3:] = R_n_crs, R_n_crs @ np.linalg.inv(angles_jacobian(angles))
-    sigma[:, 3:] = np.radians(sigma[:, 3:])
-    return geodetic, rpy, T @ (np.square(sigma)[:, :, None] * np.swapaxes(T, 1, 2))
+    return geodetic, rpy, covariance
 
 
 def _beside(header: Collection[str], *, blank: bool) -> list[Column]:

@@ -205,12 +205,16 @@ def _sigmas(path: Path, value: dict[str, Array], notes: list[str]) -> tuple[Arra
         value = value | dict.fromkeys(("sd_n", "sd_e"), value["sd_level"] / np.sqrt(2.0))
     position = [value[name] for name in ("sd_n", "sd_e", "sd_u") if name in value]
     attitude = [value[name] for name in ("sd_roll", "sd_pitch", "sd_heading") if name in value]
-    if len(position) == len(attitude) == 3:
-        return np.column_stack(position), np.radians(np.column_stack(attitude))
-    if position or attitude:
-        wanted = "SDNorth, SDEast, SDHeight, RollSD, PitchSD and HdngSD"
-        notes.append(f"{path.name}: accuracies are not complete and not used, wanted {wanted}")
-    return None, None
+    for given, what, wanted in (
+        (position, "positions", "SDNorth, SDEast and SDHeight"),
+        (attitude, "attitudes", "RollSD, PitchSD and HdngSD"),
+    ):
+        if 0 < len(given) < 3:
+            notes.append(f"{path.name}: accuracies of the {what} are not complete and not used, wanted {wanted}")
+    return (
+        np.column_stack(position) if len(position) == 3 else None,
+        np.radians(np.column_stack(attitude)) if len(attitude) == 3 else None,
+    )
 
 
 def _times(

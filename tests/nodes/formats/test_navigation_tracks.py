@@ -335,6 +335,15 @@ def test_pos_export_gives_east_before_north(tmp_path):
 
 
 @needs_data
+def test_pos_export_with_accuracies_of_the_positions_alone(tmp_path):
+    path = tmp_path / "pos.txt"
+    path.write_text(POS.read_text().replace("HEADING SD", "OTHER SD"))
+    track = read_pos_export(path)
+    np.testing.assert_allclose(track.sigma_ned_m[0], [0.017, 0.017, 0.034])
+    assert track.sigma_rpy is None and not track.has_attitude_sigmas
+
+
+@needs_data
 def test_pos_export_with_longitudes_to_360_degrees_agrees_with_its_grid(tmp_path):
     path = tmp_path / "pos.txt"
     path.write_text(re.sub(r" -115\.(\d+)", lambda said: f" {360 - float(f'115.{said[1]}'):.8f}", POS.read_text()))

@@ -138,6 +138,31 @@ def test_decimal_commas_and_sigmas_as_navigate_writes_them(tmp_path):
     np.testing.assert_allclose(np.degrees(track.sigma_rpy[0]), [0.01, 0.02, 0.03])
 
 
+@pytest.mark.parametrize("known, other", [("position", "attitude"), ("attitude", "position")])
+def test_sigmas_of_positions_count_without_those_of_attitudes_and_the_other_way_round(tmp_path, known, other):
+    sigmas = {
+        "position": ("sigma_n_m,sigma_e_m,sigma_d_m", "0.01,0.02,0.03"),
+        "attitude": ("sigma_roll_deg,sigma_pitch_deg,sigma_heading_deg", "0.001,0.002,0.003"),
+    }
+    path = tmp_path / "p.csv"
+    names, values = sigmas[known]
+    path.write_text(
+        "\n".join([f"time_s,{COLUMNS},{names}", *(f"{t},{r},{values}" for t, r in zip(UNIX, TAIL, strict=True))]) + "\n"
+    )
+    imported = read_any(path, "csv")
+    taken = {
+        "attitude": "0.01 and 0.02 deg taken (--attitude-sigma)",
+        "position": "0.2 and 0.2 m taken (--position-sigma)",
+    }
+    assert f"p.csv: no accuracies of the {other}s: {taken[other]}" in imported.notes
+    project = next(message.body for message in imported.messages if message.topic == "configuration/project")
+    # X is east, and kappa the heading of an aircraft that flies nearly level
+    position = [0.02, 0.01, 0.03] if known == "position" else Accuracy().position_m
+    kappa = 0.003 if known == "attitude" else Accuracy().attitude_deg[2]
+    np.testing.assert_allclose(project.offset_sigma_m, position, rtol=1e-3)
+    np.testing.assert_allclose(project.shift_sigma_deg[2], kappa, rtol=0.05)
+
+
 UNIX = TIMES["Unix"][1]
 
 
@@ -265,9 +290,15 @@ def test_sigmas_along_the_axes_of_a_crs_as_adjust_and_export_write_them(tmp_path
     np.testing.assert_allclose(project.offset_sigma_m, np.sqrt(np.diag(wanted))[:3], rtol=1e-3)
 
     some.write_text("\n".join(",".join(row.split(",")[:-1]) for row in (head, *texts)) + "\n")
-    notes = read_any(some, "csv", Options(crs=crs)).notes
-    assert notes[0] == "some.csv: no column sigma_kappa_deg: the other sigmas do not count"
-    assert "some.csv: no accuracies of the poses" in notes[1]
+    imported = read_any(some, "csv", Options(crs=crs))
+    assert imported.notes[0] == "some.csv: no column sigma_kappa_deg: the other sigmas of the attitude do not count"
+    assert "some.csv: no accuracies of the attitudes: 0.01 and 0.02 deg taken (--attitude-sigma)" in imported.notes
+    poses = [pose_sample(message.body) for message in imported.messages if message.topic == "trajectory/smoothed"]
+    of_place, of_angles = slice(0, 3), slice(3, 6)
+    for i, place in ((0, wanted), (2, Accuracy().covariance)):
+        np.testing.assert_allclose(poses[i].covariance[of_place, of_place], place[of_place, of_place], atol=2e-5)
+        usual = Accuracy().covariance[of_angles, of_angles]
+        np.testing.assert_allclose(poses[i].covariance[of_angles, of_angles], usual, rtol=1e-6)
 
 
 BARE = COLUMNS.replace("roll_deg", "roll")

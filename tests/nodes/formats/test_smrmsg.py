@@ -56,12 +56,12 @@ def test_accuracies_beside_an_sbet_have_the_names_that_programs_give(tmp_path, s
     assert beside(path) is None
     write_accuracies(tmp_path / smrmsg, SECONDS[[0, -1]])
     assert beside(path) == tmp_path / smrmsg
-    assert read_sbet(path, DAY).has_accuracies
+    assert read_sbet(path, DAY).has_attitude_sigmas
 
 
 def test_accuracies_beside_an_sbet_are_interpolated(tmp_path):
     sbet = write_sbet_file(tmp_path)
-    assert not read_sbet(sbet, DAY).has_accuracies
+    assert not read_sbet(sbet, DAY).has_attitude_sigmas
     start, end = SECONDS[[0, -1]]
     write_accuracies(tmp_path / "smrmsg_x.out", [start, (start + end) / 2, end])
     track = read_sbet(sbet, DAY)

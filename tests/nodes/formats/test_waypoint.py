@@ -63,7 +63,7 @@ def test_columns_in_any_order_and_unit(tmp_path, columns, header):
     assert kind_of_path(path) == "waypoint"
     track = read_waypoint(path)
     check(track, straight_track())
-    assert not track.notes and not track.has_accuracies
+    assert not (track.notes or track.has_position_sigmas or track.has_attitude_sigmas)
 
 
 def test_a_flight_in_the_south_and_west_at_0_degrees(tmp_path):
@@ -104,7 +104,8 @@ def test_accuracies_have_their_units(tmp_path):
     np.testing.assert_allclose(np.degrees(track.sigma_rpy[0]), [0.005, 0.01, 0.02])
     path.write_text(path.read_text().replace("SDNorth", "CNorth "))
     track = read_waypoint(path)
-    assert track.sigma_ned_m is None and "accuracies are not complete and not used" in track.notes[0]
+    np.testing.assert_allclose(np.degrees(track.sigma_rpy[0]), [0.005, 0.01, 0.02])
+    assert track.sigma_ned_m is None and "accuracies of the positions are not complete and not used" in track.notes[0]
 
 
 def test_another_datum_and_rotations_are_told(tmp_path):
