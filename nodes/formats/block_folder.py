@@ -11,17 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...solver.adjustment.block_data import Apriori, BlockData, ImagePoints, KnownPoints
-from ...solver.adjustment.network import ROLES, Strip
+from ...solver.adjustment.network import Strip
 from ...solver.camera.line_camera import LineCamera
-from ...solver.geometry.frames import CrsError, Frame, LocalFrame
+from ...solver.geometry.frames import CrsError, LocalFrame
 from ...solver.geometry.rotation import matrix_from_angles, quaternion_from_matrix
 from ...solver.geometry.trajectory import Trajectory
 from ...solver.models import WANDER_SIGMAS, WANDER_TIMES, setting_names
 from ..convert import LONGEST_STRIP_S
 from ..errors import UserError
 from .camera_json import read_camera
+from .ground_points import known_points, read_ground_table
 from .keys import Keys, is_there, read_toml
-from .place_columns import PLACE, check_place_units, place_column
+from .place_columns import PLACE, check_place_units, place_column, to_local
 from .projection import notes_of_heights
 from .table import Column, Table, column_names_of, one_line, read_table
 
@@ -46,13 +47,6 @@ _TRAJECTORY = (
     *(place_column(name) for name in PLACE),
     *(Column(name) for name in _POSE[3:]),
     Column("lens", "text", optional=True, blank=True),
-)
-GROUND = (
-    Column("point", "text"),
-    *(place_column(name, blank=True) for name in PLACE),
-    *(Column(name, blank=True, low=0.0) for name in ("sigma_X_m", "sigma_Y_m", "sigma_Z_m")),
-    Column("role", "text", choices=ROLES),
-    Column("target_radius_m", optional=True, blank=True, low=0.0),
 )
 _IMAGE = (
     Column("point", "text"),
@@ -99,7 +93,7 @@ def read_block(folder: Path | str, with_lines: bool = False) -> BlockData:
     camera = read_camera(folder / "camera.json", notes)
     strip_table = _strip_table(folder / "strips.csv", notes)
     poses = read_table(folder / "trajectory.csv", _TRAJECTORY, notes)
-    ground_table = read_table(folder / "ground_points.csv", GROUND, notes, may_be_empty=True)
+    ground_table = read_ground_table(folder / "ground_points.csv", notes, may_be_empty=True)
     frame = _frame(folder, crs, poses, ground_table)
     notes.extend(f"project.toml: {note}" for note in notes_of_heights(crs))
 
@@ -112,37 +106,6 @@ def read_block(folder: Path | str, with_lines: bool = False) -> BlockData:
     image_table = read_table(folder / "image_points.csv", _IMAGE, notes, may_be_empty=with_lines)
     point_ids, image = _image_points(image_table, camera, strips, ground, apriori, notes)
     return BlockData(name, frame, camera, strips, point_ids, ground, image, apriori, tuple(notes))
-
-
-def read_ground_points(
-    path: Path, crs: str, frame: LocalFrame | None, notes: list[str]
-) -> tuple[KnownPoints, LocalFrame]:
-    """Control and check points of a CSV as ``ground_points.csv`` in a block folder.
-
-    Parameters
-    ----------
-    path : file
-    crs : of the points, anything that PROJ understands
-    frame : that they get; None puts one at their middle, on the ellipsoid
-    notes : gets remarks
-
-    Returns
-    -------
-    points, and their frame
-
-    Raises
-    ------
-    UserError : ``file:line: column: what is wrong``, a CRS that PROJ does not know
-    """
-    table = read_table(path, GROUND, notes)
-    xyz = table.stack("X_m", "Y_m", "Z_m")
-    whole = np.isfinite(xyz).all(axis=1)  # planimetric points may have no height
-    try:
-        around = LocalFrame.around(xyz[whole] if whole.any() else np.nan_to_num(xyz), crs)
-    except CrsError as error:
-        raise UserError(f"{path}: {error}") from None
-    frame = around if frame is None else LocalFrame(frame.lat_deg, frame.lon_deg, frame.height_m, crs)
-    return known_points(table, frame, notes), frame
 
 
 def _name(strip: str, lens: str | None) -> str:
@@ -218,26 +181,11 @@ def _frame(folder: Path, crs: str, poses: Table, ground: Table) -> LocalFrame:
         raise UserError(f"{folder / 'project.toml'}: project.crs: {error}") from None
 
 
-def _to_local(table: Table, xyz: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
-    """Coordinates in the local frame; a point that the CRS cannot carry is named by its line."""
-    try:
-        return np.asarray(frame.from_crs(xyz), dtype=float)
-    except CrsError as error:
-        for row in range(len(xyz)):
-            try:
-                frame.from_crs(xyz[row : row + 1])
-            except CrsError:
-                where = f"{table.path}:{table.line_of(row)}: {table.headed.get('X_m', 'X_m')}"
-                hint = " (longitude first, then latitude)" if frame.units[0] == "deg" else ""
-                raise UserError(f"{where}: {xyz[row].tolist()} lies outside the area of {frame.crs!r}{hint}") from None
-        raise UserError(f"{table.path}: {error}") from None
-
-
 def _trajectories(table: Table, frame: LocalFrame, notes: list[str]) -> dict[Key, Trajectory]:
-    check_place_units(table.path, table.headed, frame)
+    check_place_units(table, frame)
     xyz, angles = table.stack(*_POSE[:3]), np.radians(table.stack(*_POSE[3:]))
     time = table["time_s"]
-    position = _to_local(table, xyz, frame)
+    position = to_local(table, xyz, frame)
     R = matrix_from_angles(*angles.T)
     if frame.crs != "local":
         R = frame.R_l_crs(xyz) @ R
@@ -345,50 +293,6 @@ def _line_times(path: Path, refuse, notes: list[str]) -> NDArray[np.float64]:
     back = np.concatenate([[False], np.diff(time) <= 0])
     table.refuse(back, "time_s", lambda i: f"{time[i]:.6f} does not come after {time[i - 1]:.6f}")
     return time
-
-
-def known_points(table: Table, frame: Frame, notes: list[str]) -> KnownPoints:
-    """Control and check points of a table with the columns `GROUND`, in a frame.
-
-    Raises
-    ------
-    UserError : ``file:line: column: what is wrong``
-    """
-    n = len(table)
-    if not n:
-        notes.append("ground_points.csv: no points: the block stands on its trajectories alone")
-        return KnownPoints((), np.empty((0, 3)), np.empty((0, 3, 3)), ())
-    check_place_units(table.path, table.headed, frame)
-    ids, role = table["point"], table["role"].astype(str)
-    repeated = np.ones(n, dtype=bool)
-    repeated[np.unique(ids.astype(str), return_index=True)[1]] = False
-    table.refuse(repeated, "point", lambda i: f"{ids[i]} comes twice")
-    xyz, sigma = table.stack("X_m", "Y_m", "Z_m"), table.stack("sigma_X_m", "sigma_Y_m", "sigma_Z_m")
-    # what a point must have: coordinates that its role makes observations, with their sigma; check points need no sigma
-    needs = np.ones((n, 3), dtype=bool)
-    needs[role == "planimetric", 2] = False
-    needs[role == "height", :2] = False
-    for axis, letter in enumerate("XYZ"):
-        column = f"{letter}_m"
-        must = needs[:, axis] if axis == 2 else np.ones(n, dtype=bool)  # height points: as approximate values
-        table.refuse(must & np.isnan(xyz[:, axis]), column, lambda i: f"missing, wanted a number ({role[i]} point)")
-        weighted = needs[:, axis] & (role != "check")
-        s = sigma[:, axis]
-        table.refuse(weighted & ~(s > 0), f"sigma_{column}", lambda i, s=s: f"{_shown(s[i])}, wanted a number above 0")
-    no_height = np.isnan(xyz[:, 2])
-    if no_height.any():
-        height = float(np.mean(xyz[~no_height, 2])) if (~no_height).any() else 0.0
-        notes.append(f"ground_points.csv: {no_height.sum()} points without height were put at {height:.1f} m")
-        xyz[no_height, 2] = height
-    xyz_l = _to_local(table, xyz, frame)  # names a point outside the area
-    R = frame.R_l_crs(xyz)
-    covariance = R @ (np.square(np.nan_to_num(sigma))[:, :, None] * np.swapaxes(R, -1, -2))
-    radius = np.nan_to_num(table["target_radius_m"]) if "target_radius_m" in table else np.zeros(n)
-    return KnownPoints(tuple(ids), xyz_l, covariance, tuple(role.tolist()), tuple(radius.tolist()))
-
-
-def _shown(value: float) -> str:
-    return "missing" if np.isnan(value) else f"{value:g}"
 
 
 def _image_points(

@@ -21,7 +21,6 @@ from ...solver.models import WANDER_SIGMAS, WANDER_TIMES
 from ...solver.navigation.inertial_data import MEMS, TACTICAL, InertialGrade
 from .. import config, registry
 from ..errors import UserError
-from .block_folder import read_ground_points
 from .block_messages import SIGMAS
 from .camera_json import read_camera
 from .dem import read_dem
@@ -29,6 +28,7 @@ from .detect import KINDS, Options, kind_of_path, read_any, read_track, sensor_s
 from .envi_image import TYPES
 from .geocal_xml import read_glas_camera
 from .ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
+from .ground_points import read_ground_points
 from .image_cubes import cubes_of, is_pattern
 from .image_lines import ImageStrip, LinesGiven, open_strips
 from .keys import Keys, is_there, read_toml

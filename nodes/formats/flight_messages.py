@@ -17,10 +17,10 @@ from ...solver.models import WANDER_TIMES
 from ..convert import camera_message, ground_point_message
 from ..errors import UserError
 from ..node import Message
-from .block_folder import read_ground_points
 from .detect import Imported, Options, read_any
 from .flight_folder import FILE, Flight, Instead, read_flight, refuse_problems
 from .ground_height import GroundGiven
+from .ground_points import read_ground_points
 from .track import Accuracy
 
 

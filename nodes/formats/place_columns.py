@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Collection
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ...schemas.units import PLACE_UNITS, place_columns
-from ...solver.geometry.frames import Frame
+from ...solver.geometry.frames import CrsError, Frame
 from ..errors import UserError
-from .table import Column
+from .table import Column, Table
 
 #: Columns of a place as tables that are read have them, in metres or in whatever unit the CRS has.
 PLACE = place_columns()
@@ -20,12 +22,12 @@ def place_column(name: str, *, blank: bool = False) -> Column:
     return Column(name, blank=blank, other_names=others)
 
 
-def check_place_units(path: Path, headed: Mapping[str, str], frame: Frame) -> None:
+def check_place_units(table: Table, frame: Frame, degrees: Collection[str] = ()) -> None:
     """Refuse columns with a unit that the CRS has not; the plain names ``X_m, Y_m, Z_m`` stand for any.
 
     Parameters
     ----------
-    path, headed : of a `Table`
+    degrees : names of columns that are in degrees without saying so
     frame : with the CRS of the coordinates
 
     Raises
@@ -33,6 +35,23 @@ def check_place_units(path: Path, headed: Mapping[str, str], frame: Frame) -> No
     UserError : ``file:1: column: what its coordinates are in``
     """
     for plain, right, unit in zip(PLACE, place_columns(frame.units), frame.units, strict=True):
-        name = headed.get(plain, plain)
-        if name not in (plain, right):
-            raise UserError(f"{path}:1: {name}: coordinates in {frame.crs!r} are in {unit}, wanted {right}")
+        name = table.headed.get(plain, plain)
+        said = f"{plain[0]}_deg" if name in degrees else name
+        if said not in (plain, right) and said in place_column(plain).names:
+            what = f"coordinates in {frame.crs!r} are in {unit}, wanted {right}"
+            raise UserError(f"{table.path}:{table.skip + 1}: {name}: {what}")
+
+
+def to_local(table: Table, xyz: NDArray[np.float64], frame: Frame) -> NDArray[np.float64]:
+    """Coordinates in the local frame; a point that the CRS cannot carry is named by its line."""
+    try:
+        return np.asarray(frame.from_crs(xyz), dtype=float)
+    except CrsError as error:
+        for row in range(len(xyz)):
+            try:
+                frame.from_crs(xyz[row : row + 1])
+            except CrsError:
+                where = f"{table.path}:{table.line_of(row)}: {table.headed.get('X_m', 'X_m')}"
+                hint = " (longitude first, then latitude)" if frame.units[0] == "deg" else ""
+                raise UserError(f"{where}: {xyz[row].tolist()} lies outside the area of {frame.crs!r}{hint}") from None
+        raise UserError(f"{table.path}: {error}") from None

@@ -33,7 +33,8 @@ from ...solver.scene_adjustment.functional import (
 from ...solver.scene_adjustment.images import ImageModel
 from ...solver.scene_adjustment.rigorous import LensView, lens_view
 from ..errors import UserError
-from .block_folder import GROUND, known_points, trajectory_settings, unknown_settings
+from .block_folder import trajectory_settings, unknown_settings
+from .ground_points import known_points, read_ground_table
 from .keys import Keys, read_toml
 from .new_file import new_file
 from .projection import notes_of_heights
@@ -384,7 +385,7 @@ def _ground(folder: Path, crs: str, ellipsoid: Ellipsoid, notes: list[str]) -> t
         )
     table = Table(path, {})
     if path.is_file():
-        table = read_table(path, GROUND, notes, may_be_empty=True)
+        table = read_ground_table(path, notes, may_be_empty=True)
     rows = len(table) if table.values else 0
     if not rows:
         notes.append("ground_points.csv: no points: the block stands on its orbits or polynomials alone")

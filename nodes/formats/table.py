@@ -101,12 +101,14 @@ class Table:
     values : by name of the `Column`
     headed : what the file calls a column that has another name there
     rows : number of each row in the file, from 0; None for all in their order
+    skip : lines above the header
     """
 
     path: Path
     values: Mapping[str, NDArray[Any]] = field(repr=False)
     headed: Mapping[str, str] = field(default_factory=dict)
     rows: NDArray[np.intp] | None = field(default=None, repr=False)
+    skip: int = 0
 
     def __len__(self) -> int:
         return len(next(iter(self.values.values())))
@@ -129,11 +131,11 @@ class Table:
     def line_of(self, row: int) -> int:
         """Line number in the file (from 1) of a row (from 0)."""
         row = row if self.rows is None else int(self.rows[row])
-        with _open(self.path) as file:
-            for place, (line, _) in enumerate(_rows(file, separator_of(self.path)[0])):
+        with _open(self.path, self.skip) as file:
+            for place, (line, _) in enumerate(_rows(file, separator_of(self.path, self.skip)[0])):
                 if place == row + 1:
-                    return line
-        return row + 2
+                    return line + self.skip
+        return row + 2 + self.skip
 
     def refuse(self, bad: ArrayLike, column: str, what: Callable[[int], str]) -> None:
         """Raise UserError for the first row where ``bad`` holds, with the count of the others."""
@@ -151,7 +153,9 @@ def one_line(problems: Sequence[str], others: int = 0) -> str:
     return problems[0] + (f" (and {least}{more} more like it)" if more > 0 else "")
 
 
-def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_be_empty: bool = False) -> Table:
+def read_table(
+    path: Path, columns: Sequence[Column], notes: list[str], *, may_be_empty: bool = False, skip: int = 0
+) -> Table:
     """Read a CSV file with a header; columns in any order, unknown ones ignored with a note.
 
     Values stand between commas, or between semicolons (then with decimal commas or points).
@@ -162,6 +166,7 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
     columns : what it may have
     notes : remarks are appended here
     may_be_empty : whether a file with a header and no rows is all right
+    skip : lines above the header that do not count
 
     Raises
     ------
@@ -171,11 +176,12 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
 
     # numbers to the last bit, which is the default only since pandas 3
     exact: dict[str, Any] = {} if int(pd.__version__.split(".")[0]) >= 3 else {"float_precision": "round_trip"}
-    header = _header(path, columns, notes)
-    separator, decimal = separator_of(path)
+    header = _header(path, columns, notes, skip)
+    separator, decimal = separator_of(path, skip)
     known = {name: column for column in columns for name in column.names if name in header}
     text: dict[str, Any] = {
-        "skipinitialspace": True, "encoding": "utf-8-sig", "index_col": False, "sep": separator, "decimal": decimal
+        "skiprows": skip, "skipinitialspace": True, "encoding": "utf-8-sig", "index_col": False,
+        "sep": separator, "decimal": decimal,
     }  # fmt: skip
     try:
         # pandas keeps blanks before a separator
@@ -192,11 +198,12 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
         )
     except ValueError:  # pandas does not say where, so every line is checked
         raise UserError(
-            one_line(_problems(path, known) or [_not_utf8(path) or f"{path}: cannot be read as CSV"])
+            one_line(_problems(path, known, skip) or [_not_utf8(path) or f"{path}: cannot be read as CSV"])
         ) from None
     # pandas ignores surplus fields of a row
-    if path.read_bytes().count(separator.encode()) != (len(header) - 1) * (len(frame) + 1):
-        problems = _problems(path, known)
+    below = path.read_bytes().split(b"\n", skip)[-1]
+    if below.count(separator.encode()) != (len(header) - 1) * (len(frame) + 1):
+        problems = _problems(path, known, skip)
         if problems:
             raise UserError(one_line(problems))
     values: dict[str, NDArray[Any]] = {}
@@ -210,10 +217,11 @@ def read_table(path: Path, columns: Sequence[Column], notes: list[str], *, may_b
             read = frame[label[name]].to_numpy(dtype=float)
         values[column.name] = read
         if not column.fits(read).all():
-            raise UserError(one_line(_problems(path, known) or [f"{path}: {name}: unreadable value"]))
+            raise UserError(one_line(_problems(path, known, skip) or [f"{path}: {name}: unreadable value"]))
     if not len(frame) and not may_be_empty:
         raise UserError(f"{path}: no rows below the header, wanted at least one")
-    return Table(path, values, {column.name: name for name, column in known.items() if name != column.name})
+    headed = {column.name: name for name, column in known.items() if name != column.name}
+    return Table(path, values, headed, skip=skip)
 
 
 def write_table(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]], formats: Mapping[str, str]) -> None:
@@ -243,14 +251,19 @@ def csv_field(text: str) -> str:
     return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\r\n') else text
 
 
-def _open(path: Path):
-    return open(path, newline="", encoding="utf-8-sig", errors="replace")
+def _open(path: Path, skip: int = 0):
+    """The text from its header on, below ``skip`` lines."""
+    file = open(path, newline="", encoding="utf-8-sig", errors="replace")  # noqa: SIM115  # closed by the caller
+    for _ in range(skip):
+        file.readline()
+    return file
 
 
-def column_names_of(path: Path) -> list[str]:
-    """The names of the columns; empty where the file is empty or no table. Between quotes or not, as values are."""
-    delimiter = separator_of(path)[0]
-    with _open(path) as file:
+def column_names_of(path: Path, skip: int = 0) -> list[str]:
+    """The names of the columns, below ``skip`` lines; empty where the file is empty or no table. Between quotes or not,
+    as values are."""
+    delimiter = separator_of(path, skip)[0]
+    with _open(path, skip) as file:
         first = next((line for line in iter(lambda: file.readline(65536), "") if line.strip()), "")
     try:
         return [name.strip() for name in next(csv.reader([first], skipinitialspace=True, delimiter=delimiter), [])]
@@ -258,13 +271,13 @@ def column_names_of(path: Path) -> list[str]:
         return []
 
 
-def separator_of(path: Path) -> tuple[str, str]:
+def separator_of(path: Path, skip: int = 0) -> tuple[str, str]:
     """What stands between the values, a comma or a semicolon, and the decimal sign.
 
     A semicolon separates where the header has one and no comma. The decimal sign is then that of the first row with a
     number that is not whole: spreadsheets write whole numbers without one.
     """
-    with _open(path) as file:
+    with _open(path, skip) as file:
         head = next((line for line in (file.readline(65536) for _ in range(8)) if line.strip()), "")
         if ";" not in head or "," in head:
             return ",", "."
@@ -292,26 +305,29 @@ def _rows(file: Any, delimiter: str):
             yield reader.line_num, [text.strip() for text in fields]
 
 
-def _header(path: Path, columns: Sequence[Column], notes: list[str]) -> list[str]:
-    with _open(path) as file:
-        _, header = next(_rows(file, separator_of(path)[0]), (0, []))
+def _header(path: Path, columns: Sequence[Column], notes: list[str], skip: int) -> list[str]:
+    line = skip + 1
+    with _open(path, skip) as file:
+        _, header = next(_rows(file, separator_of(path, skip)[0]), (0, []))
     if not header:
         raise UserError(f"{path}: empty, wanted a header with {_names(columns)}")
     if any("\0" in name or "\ufffd" in name for name in header):
         there = all(column.optional or set(column.names) & set(header) for column in columns)
         raise UserError(
-            (there and _not_utf8(path)) or f"{path}:1: not a text table, wanted a header with {_names(columns)}"
+            (there and _not_utf8(path)) or f"{path}:{line}: not a text table, wanted a header with {_names(columns)}"
         )
     known = {name for column in columns for name in column.names}
     repeated = {name for name in header if name in known and header.count(name) > 1}
     if repeated:
-        raise UserError(f"{path}:1: {sorted(repeated)[0]}: this column comes twice")
+        raise UserError(f"{path}:{line}: {sorted(repeated)[0]}: this column comes twice")
     for column in columns:
         if len(twice := [name for name in column.names if name in header]) > 1:
-            raise UserError(f"{path}:1: {twice[1]}: this column comes twice, also as {twice[0]}")
+            raise UserError(f"{path}:{line}: {twice[1]}: this column comes twice, also as {twice[0]}")
     missing = [column.name for column in columns if not column.optional and not set(column.names) & set(header)]
     if missing:
-        raise UserError(f"{path}:1: {missing[0]}: column missing, wanted {_names(columns)}{separator_hint(header)}")
+        raise UserError(
+            f"{path}:{line}: {missing[0]}: column missing, wanted {_names(columns)}{separator_hint(header)}"
+        )
     ignored = dict.fromkeys(name for name in header if name not in known)
     notes.extend(f"{path.name}: column {name!r} is not known and was ignored" for name in ignored)
     return header
@@ -341,15 +357,15 @@ def _not_utf8(path: Path) -> str | None:
     return None
 
 
-def _problems(path: Path, known: Mapping[str, Column]) -> list[str]:
+def _problems(path: Path, known: Mapping[str, Column], skip: int) -> list[str]:
     """Look at every value; used once something is known to be wrong."""
     found: list[str] = []
-    delimiter, decimal = separator_of(path)
-    with _open(path) as file:
+    delimiter, decimal = separator_of(path, skip)
+    with _open(path, skip) as file:
         rows = _rows(file, delimiter)
         _, header = next(rows)
         place = {name: header.index(name) for name in known}
-        for line, fields in rows:
+        for line, fields in ((number + skip, fields) for number, fields in rows):
             if len(fields) > len(header) and any(fields[len(header) :]):
                 found.append(f"{path}:{line}: {header[-1]}: {len(fields)} values, wanted {len(header)}")
             for name, column in known.items():

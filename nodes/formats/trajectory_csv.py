@@ -316,7 +316,7 @@ def _from_crs(path: Path, table: Table, crs: str | None, notes: list[str]) -> tu
         refuse_missing_grids(crs, path)
         try:
             frame = LocalFrame.around(xyz, crs)
-            check_place_units(path, table.headed, frame)
+            check_place_units(table, frame)
             position = frame.from_crs(xyz)
             R_l_crs = frame.R_l_crs(xyz)
         except CrsError as error:

@@ -14,10 +14,10 @@ from tracks import ns
 from triline.nodes.cli import main
 from triline.nodes.config import load
 from triline.nodes.convert import local_frame, pose_sample
-from triline.nodes.formats.block_folder import read_ground_points
 from triline.nodes.formats.detect import within
 from triline.nodes.formats.flight_folder import read_flight
 from triline.nodes.formats.geotiff import Heights, write_heights
+from triline.nodes.formats.ground_points import read_ground_points
 from triline.nodes.formats.table import read_table
 from triline.nodes.recording.reader import RecordingReader
 

@@ -1,0 +1,187 @@
+"""Tables of control and check points: ``ground_points.csv``, and lists as other programs and survey crews head them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import takewhile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...solver.adjustment.block_data import KnownPoints
+from ...solver.adjustment.network import ROLES
+from ...solver.geometry.frames import CrsError, Frame, LocalFrame
+from ..errors import UserError
+from .place_columns import PLACE, check_place_units, place_column, to_local
+from .table import Column, Table, column_names_of, read_table
+
+_SIGMAS = tuple(f"sigma_{name}" for name in PLACE)
+_COLUMNS = (
+    Column("point", "text"),
+    *(place_column(name, blank=True) for name in PLACE),
+    *(Column(name, optional=True, blank=True, low=0.0) for name in _SIGMAS),
+    Column("role", "text", optional=True, choices=ROLES),
+    Column("target_radius_m", optional=True, blank=True, low=0.0),
+    Column("accuracy", "text", optional=True, blank=True),
+    Column("level_accuracy", optional=True, blank=True, low=0.0),
+    Column("enabled", "text", optional=True, choices=("1", "0", "True", "False", "true", "false")),
+)
+#: Names of columns in lists of other programs and of survey crews, in small letters without blanks, _ and #.
+_EASTING = ("x", "e", "east", "easting", "x/east", "x/easting")
+_NORTHING = ("y", "n", "north", "northing", "y/north", "y/northing")
+_LONGITUDE, _LATITUDE = ("x/longitude", "longitude", "lon"), ("y/latitude", "latitude", "lat")
+_OTHER_NAMES = {
+    "point": ("point", "label", "name", "id", "pointid", "pointname"),
+    "X_m": _EASTING + _LONGITUDE,
+    "Y_m": _NORTHING + _LATITUDE,
+    "Z_m": ("z", "h", "height", "altitude", "elevation", "z/altitude"),
+    "sigma_X_m": ("accuracyx(m)",),
+    "sigma_Y_m": ("accuracyy(m)",),
+    "sigma_Z_m": ("accuracyz(m)", "verticalaccuracy(m)"),
+    "accuracy": ("accuracyx/y/z(m)",),
+    "level_accuracy": ("accuracyx/y(m)", "horizontalaccuracy(m)"),
+    "enabled": ("enable", "enabled"),
+}
+
+
+def read_ground_table(path: Path, notes: list[str], *, may_be_empty: bool = False) -> Table:
+    """The columns of a table of points, for `known_points`.
+
+    ``point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m,role`` and ``target_radius_m``, or names of other programs: of
+    Metashape ``Enable`` is 1 for control and 0 for a check point, one accuracy is for all axes. Without a role all
+    points are control, with a note. Lines of remarks (``# ...``) may stand above the header.
+
+    Raises
+    ------
+    UserError : ``file:line: column: what is wrong``
+    """
+    skip = _remarks(path)
+    header = column_names_of(path, skip)
+    columns = [replace(column, other_names=(*column.other_names, *_same(header, column.name))) for column in _COLUMNS]
+    table = read_table(path, columns, notes, may_be_empty=may_be_empty, skip=skip)
+    values = dict(table.values)
+    if "role" not in table and "enabled" in table:
+        enabled = np.isin(table["enabled"].astype(str), ("1", "True", "true"))
+        values["role"] = np.where(enabled, "control", "check").astype(object)
+    elif "role" not in table:
+        values["role"] = np.full(len(table), "control", dtype=object)
+        if len(table):
+            notes.append(f"{path.name}: no column role: all points are control")
+    if "accuracy" in table:
+        values |= dict(zip(_SIGMAS, _accuracies(table).T, strict=True))
+    if "level_accuracy" in table:
+        values |= dict.fromkeys(_SIGMAS[:2], table["level_accuracy"])
+    return replace(table, values=dict.fromkeys(_SIGMAS, np.full(len(table), np.nan)) | values)
+
+
+def _remarks(path: Path) -> int:
+    """How many lines above the header are remarks: a ``#`` and a blank, and no column of names behind them."""
+    names = {"point", *_OTHER_NAMES["point"]}
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
+        remarks = takewhile(
+            lambda line: line.startswith("# ") and not names & set(map(_plain, re.split("[,;]", line))), file
+        )
+        return sum(1 for _ in remarks)
+
+
+def _same(header: Sequence[str], name: str) -> list[str]:
+    """Names in a header that mean the same as that of a column."""
+    return [other for other in header if other != name and _plain(other) in _OTHER_NAMES.get(name, ())]
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[\s_#]", "", name).lower()
+
+
+def _accuracies(table: Table) -> NDArray[np.float64]:
+    """Sigmas (n, 3) along X, Y and Z of ``0.02``, ``0.02/0.05`` (in level and in height) or ``0.02/0.03/0.05``."""
+    out = np.full((len(table), 3), np.nan)
+    for row, text in enumerate(table["accuracy"]):
+        try:
+            parts = [float(part) for part in text.split("/") if part]
+        except ValueError:
+            parts = [np.nan]
+        if len(parts) > 3 or any(not part >= 0.0 for part in parts):
+            bad = np.arange(len(table)) == row
+            table.refuse(bad, "accuracy", lambda i: f"{table['accuracy'][i]!r}, wanted metres")
+        if parts:
+            out[row] = {1: parts * 3, 2: [*parts[:1], *parts], 3: parts}[len(parts)]
+    return out
+
+
+def read_ground_points(
+    path: Path, crs: str, frame: LocalFrame | None, notes: list[str]
+) -> tuple[KnownPoints, LocalFrame]:
+    """Control and check points of a CSV as ``ground_points.csv`` in a block folder.
+
+    Parameters
+    ----------
+    path : file
+    crs : of the points, anything that PROJ understands
+    frame : that they get; None puts one at their middle, on the ellipsoid
+    notes : gets remarks
+
+    Returns
+    -------
+    points, and their frame
+
+    Raises
+    ------
+    UserError : ``file:line: column: what is wrong``, a CRS that PROJ does not know
+    """
+    table = read_ground_table(path, notes)
+    xyz = table.stack("X_m", "Y_m", "Z_m")
+    whole = np.isfinite(xyz).all(axis=1)  # planimetric points may have no height
+    try:
+        around = LocalFrame.around(xyz[whole] if whole.any() else np.nan_to_num(xyz), crs)
+    except CrsError as error:
+        raise UserError(f"{path}: {error}") from None
+    frame = around if frame is None else LocalFrame(frame.lat_deg, frame.lon_deg, frame.height_m, crs)
+    return known_points(table, frame, notes), frame
+
+
+def known_points(table: Table, frame: Frame, notes: list[str]) -> KnownPoints:
+    """Control and check points of a table of `read_ground_table`, in a frame.
+
+    Raises
+    ------
+    UserError : ``file:line: column: what is wrong``
+    """
+    n = len(table)
+    if not n:
+        notes.append(f"{table.path.name}: no points: the block stands on its trajectories alone")
+        return KnownPoints((), np.empty((0, 3)), np.empty((0, 3, 3)), ())
+    check_place_units(table, frame, [name for name in table.headed.values() if _plain(name) in _LONGITUDE + _LATITUDE])
+    ids, role = table["point"], table["role"].astype(str)
+    repeated = np.ones(n, dtype=bool)
+    repeated[np.unique(ids.astype(str), return_index=True)[1]] = False
+    table.refuse(repeated, "point", lambda i: f"{ids[i]} comes twice")
+    xyz, sigma = table.stack("X_m", "Y_m", "Z_m"), table.stack("sigma_X_m", "sigma_Y_m", "sigma_Z_m")
+    # what a point must have: coordinates that its role makes observations, with their sigma; check points need no sigma
+    needs = np.ones((n, 3), dtype=bool)
+    needs[role == "planimetric", 2] = False
+    needs[role == "height", :2] = False
+    for axis, letter in enumerate("XYZ"):
+        column = f"{letter}_m"
+        must = needs[:, axis] if axis == 2 else np.ones(n, dtype=bool)  # height points: as approximate values
+        table.refuse(must & np.isnan(xyz[:, axis]), column, lambda i: f"missing, wanted a number ({role[i]} point)")
+        weighted = needs[:, axis] & (role != "check")
+        s = sigma[:, axis]
+        table.refuse(weighted & ~(s > 0), f"sigma_{column}", lambda i, s=s: f"{_shown(s[i])}, wanted a number above 0")
+    no_height = np.isnan(xyz[:, 2])
+    if no_height.any():
+        height = float(np.mean(xyz[~no_height, 2])) if (~no_height).any() else 0.0
+        notes.append(f"{table.path.name}: {no_height.sum()} points without height were put at {height:.1f} m")
+        xyz[no_height, 2] = height
+    xyz_l = to_local(table, xyz, frame)  # names a point outside the area
+    R = frame.R_l_crs(xyz)
+    covariance = R @ (np.square(np.nan_to_num(sigma))[:, :, None] * np.swapaxes(R, -1, -2))
+    radius = np.nan_to_num(table["target_radius_m"]) if "target_radius_m" in table else np.zeros(n)
+    return KnownPoints(tuple(ids), xyz_l, covariance, tuple(role.tolist()), tuple(radius.tolist()))
+
+
+def _shown(value: float) -> str:
+    return "missing" if np.isnan(value) else f"{value:g}"

@@ -1,0 +1,91 @@
+"""Lists of control and check points, as `ground_points.csv` and as other programs head them."""
+
+import numpy as np
+import pyproj
+import pytest
+
+from triline.nodes.errors import UserError
+from triline.nodes.formats.ground_points import read_ground_points
+
+UTM, LONLAT = "EPSG:32632", "EPSG:4326"
+PLACE = pyproj.Transformer.from_crs(UTM, LONLAT).transform(691000.5, 5334000.2)
+PROJCS = '# CoordinateSystem: PROJCS["WGS 84 / UTM zone 32N",GEOGCS["WGS 84",DATUM["WGS 1984"]]]'
+
+
+def read(path, text, crs=UTM):
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    notes = []
+    points, frame = read_ground_points(path, crs, None, notes)
+    sigma = np.sqrt(np.einsum("nii->ni", points.covariance))
+    return points, frame.to_geodetic(points.xyz_l), sigma, notes
+
+
+LISTS = {
+    "ours": "point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m,role\n"
+    "P1,691000.5,5334000.2,512.3,0.01,0.02,0.03,control\n",
+    "in small letters": "point,x,y,z,sigma_X_m,sigma_Y_m,sigma_Z_m\nP1,691000.5,5334000.2,512.3,0.01,0.02,0.03\n",
+    "northing first": "NORTHING,EASTING,sigma_Y_m,sigma_X_m,sigma_Z_m,Elevation,Point ID\n"
+    "5334000.2,691000.5,0.02,0.01,0.03,512.3,P1\n",
+    "a spreadsheet": "\ufeffName;E;N;H;sigma_X_m;sigma_Y_m;sigma_Z_m\r\nP1;691000,5;5334000,2;512,3;0,01;0,02;0,03\r\n",
+    "Metashape": f"{PROJCS}\n#Label,Enable,X/Easting,Y/Northing,Z/Altitude,Accuracy_X/Y/Z_(m)\n"
+    "P1,1,691000.500000,5334000.200000,512.300000,0.01/0.02/0.03\n",
+    "a header as a remark": "# point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m\n"
+    "P1,691000.5,5334000.2,512.3,0.01,0.02,0.03\n",
+}
+
+
+@pytest.mark.parametrize("what", LISTS)
+def test_a_point_is_where_and_as_good_as_each_list_says(tmp_path, what):
+    points, place, sigma, notes = read(tmp_path / "control.csv", LISTS[what])
+    assert (points.id, points.role) == (("P1",), ("control",))
+    np.testing.assert_allclose(place, [[*PLACE, 512.3]], rtol=0, atol=1e-8)
+    # 2 deg of convergence mix X and Y a little
+    np.testing.assert_allclose(sigma, [[0.01, 0.02, 0.03]], rtol=2e-2)
+    said = [] if what in ("ours", "Metashape") else ["control.csv: no column role: all points are control"]
+    assert notes == said
+
+
+def test_one_accuracy_and_those_in_level_and_in_height(tmp_path):
+    head = "#Label,Enable,X/Longitude,Y/Latitude,Z/Altitude,Accuracy_X/Y/Z_(m),X_error\n"
+    rows = ["A,1,11.5,48.1,500,0.05,0.1", "B,0,11.6,48.2,510,0.02/0.05,", "C,True,11.7,48.3,520,0.01/0.02/0.03,"]
+    points, place, sigma, notes = read(tmp_path / "ms.csv", head + "\n".join(rows) + "\n", LONLAT)
+    assert points.role == ("control", "check", "control")
+    np.testing.assert_allclose(place, [[48.1, 11.5, 500], [48.2, 11.6, 510], [48.3, 11.7, 520]], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(sigma, [[0.05, 0.05, 0.05], [0.02, 0.02, 0.05], [0.01, 0.02, 0.03]], rtol=1e-3)
+    assert notes == ["ms.csv: column 'X_error' is not known and was ignored"]
+    text = (
+        "Label,Longitude,Latitude,Altitude,Horizontal accuracy (m),Vertical accuracy (m)\nA,11.5,48.1,500,0.02,0.04\n"
+    )
+    np.testing.assert_allclose(read(tmp_path / "p4d.csv", text, LONLAT)[2], [[0.02, 0.02, 0.04]], rtol=1e-3)
+
+
+HEAD = "#Label,Enable,X/Easting,Y/Northing,Z/Altitude,Accuracy_X/Y/Z_(m)"
+ROW = "P1,1,691000.5,5334000.2,512.3,0.02"
+BAD = {
+    "no sigma": ("Name,E,N,H\nP1,691000.5,5334000.2,512.3\n", r"control\.csv:2: sigma_X_m: missing, wanted a number"),
+    "no height": ("Name,E,N\nP1,691000.5,5334000.2\n", r"control\.csv:1: Z_m: column missing"),
+    "no header": ("P1,691000.5,5334000.2,512.3\n", r"control\.csv:1: point: column missing, wanted point,X_m,Y_m,Z_m"),
+    "degrees": (
+        "Name,Longitude,Latitude,Height,sigma_X_m,sigma_Y_m,sigma_Z_m\nP1,11.5,48.1,500,1,1,1\n",
+        r"control\.csv:1: Longitude: coordinates in 'EPSG:32632' are in m, wanted X_m",
+    ),
+    "two names": ("Name,ID,E,N,H\nP1,7,691000.5,5334000.2,512.3\n", "ID: this column comes twice, also as Name"),
+    "a letter below remarks": (
+        f"{PROJCS}\n# at noon\n{HEAD}\n{ROW}\n{ROW.replace('512.3', '51z.3')}\n",
+        r"control\.csv:5: Z/Altitude: '51z\.3' is not a number",
+    ),
+    "accuracy": (f"{HEAD}\n{ROW}/0.03/0.04/0.05\n", r"control\.csv:2: Accuracy_X/Y/Z_\(m\): .*wanted metres"),
+    "accuracy in words": (
+        f"{PROJCS}\n{HEAD}\n{ROW} m\n",
+        r"control\.csv:3: Accuracy_X/Y/Z_\(m\): '0\.02 m', wanted met",
+    ),
+    "enabled": (f"{HEAD}\n{ROW.replace(',1,', ',7,')}\n", r"control\.csv:2: Enable: '7', wanted one of 1, 0"),
+    "surplus": (f"{PROJCS}\n{HEAD}\n{ROW},5\n", r"control\.csv:3: .*7 values, wanted 6"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_a_list_that_cannot_be_read_is_told_by_its_line(tmp_path, what):
+    text, wanted = BAD[what]
+    with pytest.raises(UserError, match=wanted):
+        read(tmp_path / "control.csv", text)
