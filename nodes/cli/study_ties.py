@@ -107,11 +107,13 @@ def evaluated(
 ) -> tuple[Array, list[Message], float]:
     """Mean squared errors (9,) of the final orientation and of the ground that it gives; ties; sigma0."""
     out = processed(messages, nodes, folder)
+    ties = list(RecordingReader(out).messages(["observation/tie"]))
+    if not any(map(is_matched, ties)):
+        raise UserError("a flight in which no tie point is matched, wanted more --pixels or --seconds")
     flight = collect(messages_of(out))
     time_ns, error, *_ = orientation_errors(flight)["final"]
     ground = checks.errors((time_ns - EPOCH_NS) * 1e-9, error)
     squares = np.concatenate([(error**2).mean(axis=0), (ground**2).mean(axis=0)])
-    ties = list(RecordingReader(out).messages(["observation/tie"]))
     return squares, ties, float(flight.reports[-1][1].sigma0_total)
 
 

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from ..errors import UserError
 from .byte_order_mark import without_mark
+from .number_rows import numbered_lines, numbers_of
 from .table import Column, column_names_of, read_table, separator_hint
 from .time_columns import WANTED, time_columns, times_of
-from .vendor_poses import headwall_clock, numbered_lines, numbers_of, resonon_first_ns
+from .vendor_poses import headwall_clock, resonon_first_ns
 
 #: Readings of a log's clock before and behind the lines whose times it tells.
 _AROUND = 200
@@ -48,7 +49,7 @@ def line_times(path: Path, day: date | None, notes: list[str]) -> NDArray[np.int
     header = column_names_of(path)
     columns = time_columns(header)
     if not columns:
-        raise UserError(f"{path}:1: time: column missing, wanted line and {WANTED}{separator_hint(header)}")
+        raise UserError(f"{path}:1: time: column missing, wanted line and {WANTED}{separator_hint(header, 'time_s')}")
     table = read_table(path, [Column("line", "integer", low=0), *columns], notes)
     line = table["line"]
     table.refuse(line != np.arange(len(line)), "line", lambda i: f"{line[i]:.0f}, wanted {i} (0, 1, 2, ...)")

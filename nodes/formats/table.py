@@ -326,19 +326,19 @@ def _header(path: Path, columns: Sequence[Column], notes: list[str], skip: int) 
     missing = [column.name for column in columns if not column.optional and not set(column.names) & set(header)]
     if missing:
         raise UserError(
-            f"{path}:{line}: {missing[0]}: column missing, wanted {_names(columns)}{separator_hint(header)}"
+            f"{path}:{line}: {missing[0]}: column missing, wanted {_names(columns)}{separator_hint(header, missing[0])}"
         )
     ignored = dict.fromkeys(name for name in header if name not in known)
     notes.extend(f"{path.name}: column {name!r} is not known and was ignored" for name in ignored)
     return header
 
 
-def separator_hint(header: Sequence[str]) -> str:
+def separator_hint(header: Sequence[str], missing: str) -> str:
     """What may be wrong with a header in which a column is missing; "" where that is nothing else."""
     if len(header) < 2:
         return "; is the separator a comma?" if any(c in name for name in header for c in "\t ") else ""
-    capitals = all(name.isupper() for name in header)
-    return f"; capital letters count: {header[0]} stands there" if capitals else ""
+    same = next((name for name in header if name != missing and name.lower() == missing.lower()), None)
+    return f"; capital letters count: {same} stands there" if same else ""
 
 
 def _names(columns: Sequence[Column]) -> str:

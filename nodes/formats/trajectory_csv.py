@@ -251,7 +251,7 @@ def _header(path: Path) -> tuple[list[str], list[Column]]:
     header = column_names_of(path)
     time = time_columns(header)
     if not time:
-        raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}{separator_hint(header)}")
+        raise UserError(f"{path}:1: time_s: column missing, wanted {WANTED}{separator_hint(header, 'time_s')}")
     return header, time
 
 

@@ -13,8 +13,9 @@ from ..convert import LATEST_S
 from ..errors import UserError
 from .byte_order_mark import without_mark
 from .gps_time import GPS_EPOCH_S, utc_ns_from_gps
+from .number_rows import numbered_lines, numbers_of
 from .plausible import check_units
-from .table import MOST_PROBLEMS, one_line
+from .table import one_line
 from .time_columns import is_same_day, same_day
 from .track import NavigationTrack, checked
 
@@ -163,39 +164,3 @@ def _utc_ns(words: list[str]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
     digits = np.array([part.isdecimal() for part in parts])
     fraction_ns = np.array([round(float(f"0.{p}") * 1e9) if p.isdecimal() else 0 for p in parts], dtype=np.int64)
     return instants.astype(np.int64) + fraction_ns, np.flatnonzero(np.isnat(instants) | ~digits)
-
-
-def numbered_lines(path: Path) -> list[tuple[int, str]]:
-    """Number and text of the lines that are not blank."""
-    text = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
-    return [(i, line) for i, line in enumerate(text, 1) if line.strip()]
-
-
-def numbers_of(path: Path, lines: list[tuple[int, list[str]]], place: dict[str, int]) -> NDArray[np.float64]:
-    """Values (n, columns) of the columns at their places."""
-    at = tuple(place.values())
-    try:
-        values = np.array([[float(fields[i]) for i in at] for _, fields in lines])
-        if len(values) > 1 and np.isfinite(values).all():
-            return values
-    except (ValueError, IndexError):
-        pass  # told below, which takes four times as long
-    rows, problems = [], []
-    for number, fields in lines:
-        row = []
-        for name, i in place.items():
-            text = fields[i].strip() if i < len(fields) else ""
-            try:
-                row.append(float(text))
-            except ValueError:
-                row.append(np.nan)
-            if not np.isfinite(row[-1]):
-                problems.append(f"{path}:{number}: {name}: {f'{text!r} is not a number' if text else 'missing'}")
-        rows.append(row)
-        if len(problems) >= MOST_PROBLEMS:
-            break
-    if problems:
-        raise UserError(one_line(problems))
-    if len(rows) < 2:
-        raise UserError(f"{path}: {len(rows)} rows, wanted at least 2")
-    return np.array(rows)

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from ..errors import UserError
 from .gps_time import DAY_S, WEEK_S, gps_week
+from .number_rows import numbered_lines, numbers_of
 from .plausible import check_units
 from .table import MOST_PROBLEMS, one_line
 from .time_columns import same_day
 from .track import NavigationTrack, checked, times_from_gps
-from .vendor_poses import numbered_lines, numbers_of
 
 Array = NDArray[np.float64]
 #: Lines of a text with their numbers, split into words.

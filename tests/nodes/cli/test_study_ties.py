@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from triline.nodes.cli import main
 from triline.nodes.cli.study_ties import COMPONENTS, by_flights, lines, luck, ratios
 
 FLIGHTS = 12
@@ -51,3 +52,9 @@ def test_verdict_tells_equals_from_worse():
     verdicts = [line.strip() for line in text if "matched over simulated" in line]
     assert verdicts[0].startswith("met:") and verdicts[1].startswith("NOT MET:")
     assert all("simulated over simulated 1 +- 0.0" in verdict for verdict in verdicts)
+
+
+def test_a_flight_without_a_matched_tie_is_refused(capsys):
+    """NumPy warned of the mean of an empty slice, and the ratios were not numbers."""
+    assert main(["study", "ties", "--seeds", "2", "--again", "1", "--seconds", "6", "--pixels", "60"]) == 1
+    assert "a flight in which no tie point is matched, wanted more --pixels or --seconds" in capsys.readouterr().err
