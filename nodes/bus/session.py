@@ -9,11 +9,8 @@ again and again. Nobody is a hub that all depend on.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import json
-import os
 import re
-import socket
 import threading
 import time
 from collections import deque
@@ -29,11 +26,12 @@ from ...schemas.envelope import Envelope, RawMessage, pack, unpack
 from ..errors import UserError
 from ..node import Message
 from .links import BEAT_S, LinkWatch
+from .ports import default_port, port_is_held, why_not_free
+from .zenoh_words import one_line
 
 if TYPE_CHECKING:  # certificates take a tenth of a second to import
     from .bundle import Bundle
 
-DEFAULT_PORT = 17447
 #: Messages of a latched topic that a publisher keeps for whoever joins later.
 LATCHED_KEPT = 100_000
 #: What else is recorded, and is not too much (pictures), a publisher keeps for those who missed it: for so long, s, at
@@ -60,16 +58,6 @@ CLOSED_S = 5.0
 LINK = "link"
 #: Names of topics that others tell are shorter than this.
 LONGEST_TOPIC = 200
-#: Keys that Zenoh knows are told where they are no more than so many.
-MOST_KNOWN = 6
-
-
-def default_port() -> int:
-    """The meeting port: the environment variable TRILINE_PORT, or 17447."""
-    text = os.environ.get("TRILINE_PORT", str(DEFAULT_PORT))
-    if not text.isdigit() or not 0 < int(text) < 65536:
-        raise UserError(f"TRILINE_PORT is {text!r}, wanted a port number")
-    return int(text)
 
 
 def configuration(port: int | None = None, file: str | Path | None = None) -> zenoh.Config:
@@ -80,7 +68,7 @@ def configuration(port: int | None = None, file: str | Path | None = None) -> ze
         try:
             config = zenoh.Config.from_file(file)
         except Exception as error:
-            raise UserError(f"{file}: not a Zenoh configuration: {_one_line(error)}") from None
+            raise UserError(f"{file}: not a Zenoh configuration: {one_line(error)}") from None
         config.insert_json5("timestamping/enabled", "true")  # late joiners are served by time
         if port is not None:  # of a bundle, on another port than it says
             for key in ("listen/endpoints", "connect/endpoints"):
@@ -111,17 +99,6 @@ def configuration(port: int | None = None, file: str | Path | None = None) -> ze
     return config
 
 
-def port_is_held(port: int) -> bool:
-    """Whether a program listens on a port of loopback."""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was just given up is free
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError:
-            return True
-    return False
-
-
 def why_no_listening(file: Path, port: int | None = None) -> list[str]:
     """Where a router cannot listen now, and why: it tries again, without a word.
 
@@ -134,13 +111,9 @@ def why_no_listening(file: Path, port: int | None = None) -> list[str]:
         found = re.fullmatch(r"\w+/\[?([^\]]+?)\]?:(\d+)", endpoint)
         if found is None:
             continue
-        try:
-            family, _, _, _, address = socket.getaddrinfo(found[1], int(found[2]), type=socket.SOCK_STREAM)[0]
-            with socket.socket(family) as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was just given up is free
-                probe.bind(address)
-        except OSError as error:
-            told.append(f"{found[1]}:{found[2]}: {(error.strerror or str(error)).lower()}")
+        why = why_not_free(found[1], int(found[2]))
+        if why:
+            told.append(f"{found[1]}:{found[2]}: {why}")
     return told
 
 
@@ -196,7 +169,7 @@ class Bus:
             self._session = zenoh.open(configuration(self._port, file))
         except zenoh.ZError as error:
             where = f"{file}: " if file is not None else ""
-            raise UserError(f"{where}cannot open the bus: {self._why_closed() or _one_line(error)}") from None
+            raise UserError(f"{where}cannot open the bus: {self._why_closed() or one_line(error)}") from None
         self._publishers: dict[str, Any] = {}
         self._recipes: list[Recipe] = []  # how all that is declared is declared again
         self._declared: list[Any] = []
@@ -591,7 +564,7 @@ class Bus:
                 if why:
                     self._open_anew(why)
             except zenoh.ZError as error:  # it is tried again
-                self.opened_anew.append(f"cannot be opened anew: {_one_line(error)}")
+                self.opened_anew.append(f"cannot be opened anew: {one_line(error)}")
 
     def open_anew(self, why: str) -> bool:
         """Take another session in place of one whose link carries nothing; False where none can be opened now."""
@@ -691,7 +664,7 @@ def listen_elsewhere(
             try:
                 config.insert_json5(key, json.dumps(value))
             except zenoh.ZError as error:
-                raise UserError(f"{endpoint}: not a Zenoh endpoint: {_one_line(error)}") from None
+                raise UserError(f"{endpoint}: not a Zenoh endpoint: {one_line(error)}") from None
 
         def take(sample: Any) -> None:
             if sample.kind == zenoh.SampleKind.PUT:
@@ -706,7 +679,7 @@ def listen_elsewhere(
                 for subscriber in subscribers:
                     subscriber.undeclare()
         except zenoh.ZError as error:
-            raise UserError(f"{endpoint}: {_one_line(error)}") from None
+            raise UserError(f"{endpoint}: {one_line(error)}") from None
 
     return open_session()
 
@@ -732,7 +705,7 @@ def routing(file: Path, port: int | None = None) -> Iterator[Callable[[], int]]:
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
-        raise UserError(f"the router cannot listen: {_one_line(error)}") from None
+        raise UserError(f"the router cannot listen: {one_line(error)}") from None
 
     def here(query: Any) -> None:
         with query:
@@ -748,32 +721,3 @@ def routing(file: Path, port: int | None = None) -> Iterator[Callable[[], int]]:
 
 def _parameters(text: str) -> list[tuple[str, str]]:
     return [(key, value) for key, _, value in (part.partition("=") for part in text.split(";") if part)]
-
-
-def _unknown_word(text: str) -> str:
-    """Which key or value of a configuration Zenoh does not know, where, and what may be meant; "" for another error."""
-    found = re.search(r"unknown (field|variant) `([^`]*)`, expected (?:one of )?((?:`[^`]*`(?:, | or )?)+)", text)
-    if found is None:
-        return ""
-    known = re.findall(r"`([^`]*)`", found[3])
-    near = difflib.get_close_matches(found[2], known, n=1) or (known if len(known) <= MOST_KNOWN else [])
-    wanted = " or ".join(filter(None, (", ".join(near[:-1]), *near[-1:])))
-    more = f"one of {len(known)}: {', '.join(sorted(known)[:MOST_KNOWN])} .."
-    line = re.search(r"\bline:? (\d+)", text[found.end() :])
-    kind = "key" if found[1] == "field" else "value"
-    return f"{f'line {line[1]}: ' if line else ''}unknown {kind} {found[2]!r}, wanted {wanted or more}"
-
-
-def _one_line(error: Exception) -> str:
-    """What Zenoh says, without the place in its own source and the picture of the line."""
-    text = str(error)
-    if said := _unknown_word(text):
-        return said
-    found = re.search(r"JSON error: Message \{ msg: \"(.*?)\", location: Some\(Location \{ line: (\d+)", text)
-    if found:
-        return f"line {found[2]}: {found[1]}"[:300]
-    text = re.sub(r"\s+at /\S+\.rs:\d+\.?", "", text)
-    picture = re.search(r"--> (\d+):(\d+)\n.*\n\s*=\s*(.*)", text, re.DOTALL)
-    if picture:
-        text = f"line {picture[1]}, column {picture[2]}: {picture[3]}"
-    return " ".join(text.split())[:300]

@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from ..bus.ports import port_is_held
 from ..bus.processes import NodeGroup
-from ..bus.session import port_is_held
 from ..errors import UserError
 from ..formats.json_text import json_text
 from .live_flight import ESTIMATORS, LiveFlight, add_view_arguments, seconds_between

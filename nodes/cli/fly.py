@@ -15,6 +15,7 @@ import numpy as np
 
 from ...schemas import codec
 from ...schemas.envelope import RawMessage
+from ..bus.ports import default_port, port_is_held
 from ..bus.processes import NodeGroup
 from ..convert import check_place
 from ..errors import UserError
@@ -167,8 +168,6 @@ class Fly(LiveFlight):
         self._tell_phase()
 
     def port(self) -> int:
-        from ..bus.session import default_port, port_is_held
-
         port = self.args.port or (default_port() if self.secure is None else self.secure.port)
         if self.args.bus is None and port_is_held(port):
             self._refuse_flown(port)

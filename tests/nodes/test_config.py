@@ -12,7 +12,8 @@ from bus_rig import free_port
 from places import ROOT
 
 from triline.nodes import registry
-from triline.nodes.bus.session import DEFAULT_PORT, configuration, default_port
+from triline.nodes.bus.ports import DEFAULT_PORT, default_port
+from triline.nodes.bus.session import configuration
 from triline.nodes.cli import main
 from triline.nodes.config import build, load, settings_of
 from triline.nodes.errors import UserError
