@@ -30,6 +30,7 @@ from ...solver.camera.line_camera import LineCamera
 from ...solver.camera.self_calibration import SelfCalibration, calibrated, unit_of
 from ...solver.geometry.frames import CrsError, LocalFrame
 from ...solver.models.base import ERROR_GROUPS
+from ..first_of import first_of
 from ..formats.json_text import plain
 
 Array = NDArray[np.floating]
@@ -422,12 +423,11 @@ def _axes_notes(frame: LocalFrame) -> list[str]:
 def _doubt_note(result: BatchResult) -> str:
     """Which points are doubtful, and which of them are missing in the statistics of the check points."""
     network, doubtful = result.network, result.doubtful
-    shown = ", ".join(f"{network.point_ids[d.point]} ({d.lost} of {d.rays} rays out)" for d in doubtful[:MOST_LISTED])
-    more = f" and {len(doubtful) - MOST_LISTED} more" if len(doubtful) > MOST_LISTED else ""
+    shown = first_of([f"{network.point_ids[d.point]} ({d.lost} of {d.rays} rays out)" for d in doubtful], MOST_LISTED)
     check = set(network.check.point.tolist())
     out = sum(d.point in check for d in doubtful)
     left = f"; {out} of them check points, left out of the statistics" if out else ""
-    return f"{len(doubtful)} object points are doubtful, their remaining rays do not confirm them: {shown}{more}{left}"
+    return f"{len(doubtful)} object points are doubtful, their remaining rays do not confirm them: {shown}{left}"
 
 
 def _sigma0_note(result: BatchResult) -> str:
@@ -455,12 +455,12 @@ def _weakness_notes(result: BatchResult) -> list[str]:
     if not result.weak:
         return []
     free = len(result.solution.factor.undetermined) > 0
-    shown = "; ".join(c.words for c in result.weak[:MOST_NAMED])
+    words = [c.words for c in result.weak]
     if len(result.weak) > MANY_WEAK:  # flexible models are meant to lean on their weights where rays are few
         count = f"{len(result.weak)} combinations of the {result.solution.layout.n_unknowns} unknowns"
+        shown = "; ".join(words[:MOST_NAMED])
         return [f"{count} rest on a-priori weights, as flexible models do between rays; least determined: {shown}"]
-    more = f"; and {len(result.weak) - MOST_NAMED} more" if len(result.weak) > MOST_NAMED else ""
-    return [("not determined: " if free else "resting on a-priori weights alone: ") + shown + more]
+    return [("not determined: " if free else "resting on a-priori weights alone: ") + first_of(words, MOST_NAMED, "; ")]
 
 
 def _test_notes(adjustment: Adjustment) -> list[str]:
@@ -594,7 +594,7 @@ def _strip_notes(result: BatchResult) -> list[str]:
     lone = [strip.id for i, strip in enumerate(result.network.strips) if i not in corrected]
     if not lone:
         return []
-    names = ", ".join(lone[:MOST_NAMED]) + (f" and {len(lone) - MOST_NAMED} more" if len(lone) > MOST_NAMED else "")
+    names = first_of(lone, MOST_NAMED)
     return [f"strips without image points take no part, and their orientation is in no table: {names}"]
 
 

@@ -39,6 +39,7 @@ from ...solver.scene_adjustment.solution import (
     where_rays_meet,
 )
 from ..errors import UserError
+from ..first_of import first_of
 from ..formats.json_text import plain
 from ..formats.satellite.rpc_files import write_rpb
 from ..formats.scene_block import ImageEntry, SceneBlockData
@@ -533,8 +534,7 @@ def _notes(a: SceneAdjustment) -> list[str]:
     undetermined = np.setdiff1d(np.flatnonzero(~s.determined), alone)
     lost = [data.point_ids[p] for p in undetermined if (data.rays.point == p).any()]
     if lost:
-        shown = ", ".join(lost[:5]) + (f" and {len(lost) - 5} more" if len(lost) > 5 else "")
-        notes.append(f"{len(lost)} points are not determined by their rays and were left out: {shown}")
+        notes.append(f"{len(lost)} points are not determined by their rays and were left out: {first_of(lost, 5)}")
     blind = int((~np.isfinite(s.residual_px).all(axis=1)).sum())
     if blind:
         notes.append(f"{blind} rays look away from their point and take no part")

@@ -52,6 +52,7 @@ from ..batch.partition_runner import DaskRunner, FolderStore, ProcessRunner
 from ..batch.scene_adjustment import SETS
 from ..batch.two_steps import OWNERS, UNUSED, sigmas_stated, step_settings
 from ..errors import UserError
+from ..first_of import first_of
 from ..formats.block_folder import is_block_folder, read_block
 from ..formats.block_recording import TOPICS, block_from_messages
 from ..formats.camera_json import read_camera_instead, write_camera
@@ -389,16 +390,11 @@ def joining_notes(joined: JoinedBlock, names: Sequence[str]) -> list[str]:
     if joined.elsewhere:
         notes.append(f"{joined.elsewhere} tie points have a name that comes again at another place, and are kept apart")
     if joined.restated:
-        of = ", ".join(f"{point} (those of {name} count)" for point, name in joined.restated[:RENAMED_SHOWN])
-        more = len(joined.restated) - RENAMED_SHOWN
-        notes.append(
-            f"known points with sigmas that are not the same in all recordings: {of}"
-            + (f", and {more} more" if more > 0 else "")
-        )
+        of = first_of([f"{point} (those of {name} count)" for point, name in joined.restated], RENAMED_SHOWN)
+        notes.append(f"known points with sigmas that are not the same in all recordings: {of}")
     if joined.renamed:
-        shown = ", ".join(f"{id} of {name} is {new}" for name, id, new in joined.renamed[:RENAMED_SHOWN])
-        more = len(joined.renamed) - RENAMED_SHOWN
-        notes.append(f"strips of the same name: {shown}" + (f", and {more} more" if more > 0 else ""))
+        shown = first_of([f"{id} of {name} is {new}" for name, id, new in joined.renamed], RENAMED_SHOWN)
+        notes.append(f"strips of the same name: {shown}")
     notes.append(
         "corrections and a-priori sigmas of the trajectory are those of each recording, camera and sigma factors common"
     )

@@ -15,6 +15,7 @@ from ...schemas import messages as m
 from ...schemas.envelope import RawMessage
 from ...schemas.topics import Family, find
 from ..errors import UserError
+from ..first_of import first_of
 from ..formats.json_text import json_text
 from ..node import Message
 from ..voices import is_voiced
@@ -214,8 +215,7 @@ def _wait(done: Any, seconds: float) -> bool:
 
 
 def _few(names: set[str]) -> str:
-    shown = sorted(names)
-    return ", ".join(shown[:12]) + (f" and {len(shown) - 12} more" if len(shown) > 12 else "")
+    return first_of(sorted(names), 12)
 
 
 def _user() -> str:

@@ -20,6 +20,7 @@ from ...solver.geometry.trajectory import Trajectory
 from ...solver.models import WANDER_TIMES
 from ...solver.models.dgr import DgrOptions
 from ..convert import SECOND_NS, camera_message, ground_point_message, largest_step_ns, pose_message
+from ..first_of import first_of
 from ..node import Message
 
 #: Time between strips whose times overlap in the files, after they are shifted, s.
@@ -89,10 +90,9 @@ def not_carried(block: BlockData) -> list[str]:
     moved = shift - min(shift, default=0.0)
     later = [f"{strip.id} by {by:.0f} s" for strip, by in zip(block.strips, moved.tolist(), strict=True) if by]
     if later:
-        more = f" and {len(later) - MOST_NAMED} more" if len(later) > MOST_NAMED else ""
         notes.append(
             "times of strips overlap: the recording, and all that is made of it, has strips later than the files do: "
-            f"{', '.join(later[:MOST_NAMED])}{more}"
+            + first_of(later, MOST_NAMED)
         )
     return notes
 

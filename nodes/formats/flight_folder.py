@@ -21,6 +21,7 @@ from ...solver.models import WANDER_SIGMAS, WANDER_TIMES
 from ...solver.navigation.inertial_data import MEMS, TACTICAL, InertialGrade
 from .. import config, registry
 from ..errors import UserError
+from ..first_of import first_of
 from .block_messages import SIGMAS
 from .camera_json import read_camera
 from .dem import read_dem
@@ -634,9 +635,8 @@ def _strip(flight: Flight, keys: Keys) -> None:
     named = {name: flight.folder / name for _, name, _ in files}
     missing = [name for name, path in named.items() if not is_there(path) and not is_pattern(path)]
     if len(missing) > 1:
-        shown = ", ".join(name[:200] for name in missing[:MISSING_SHOWN])
-        more = f" and {len(missing) - MISSING_SHOWN} more" if len(missing) > MISSING_SHOWN else ""
-        raise UserError(f"{keys.path}: {images.where}: {len(missing)} files are not in the folder: {shown}{more}")
+        shown = first_of([name[:200] for name in missing], MISSING_SHOWN)
+        raise UserError(f"{keys.path}: {images.where}: {len(missing)} files are not in the folder: {shown}")
     for view, name, _ in files:
         if name in missing:
             _beside(flight, images, view, name)
