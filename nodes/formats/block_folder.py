@@ -93,7 +93,7 @@ def read_block(folder: Path | str, with_lines: bool = False) -> BlockData:
     camera = read_camera(folder / "camera.json", notes)
     strip_table = _strip_table(folder / "strips.csv", notes)
     poses = read_table(folder / "trajectory.csv", _TRAJECTORY, notes)
-    ground_table = read_ground_table(folder / "ground_points.csv", notes, may_be_empty=True)
+    ground_table = read_ground_table(folder / "ground_points.csv", crs, notes, may_be_empty=True)
     frame = _frame(folder, crs, poses, ground_table)
     notes.extend(f"project.toml: {note}" for note in notes_of_heights(crs))
 

@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import takewhile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...solver.adjustment.block_data import KnownPoints
 from ...solver.adjustment.network import ROLES
-from ...solver.geometry.frames import CrsError, Frame, LocalFrame
+from ...solver.geometry.frames import GEOGRAPHIC, CrsError, Frame, LocalFrame
 from ..errors import UserError
 from .place_columns import PLACE, check_place_units, place_column, to_local
 from .table import Column, Table, column_names_of, read_table
@@ -29,7 +30,8 @@ _COLUMNS = (
     Column("level_accuracy", optional=True, blank=True, low=0.0),
     Column("enabled", "text", optional=True, choices=("1", "0", "True", "False", "true", "false")),
 )
-#: Names of columns in lists of other programs and of survey crews, in small letters without blanks, _ and #.
+#: Names of columns in lists of other programs and of survey crews, in small letters without blanks, _ and #; the first
+#: that a list has is the one that counts.
 _EASTING = ("x", "e", "east", "easting", "x/east", "x/easting")
 _NORTHING = ("y", "n", "north", "northing", "y/north", "y/northing")
 _LONGITUDE, _LATITUDE = ("x/longitude", "longitude", "lon"), ("y/latitude", "latitude", "lat")
@@ -47,8 +49,8 @@ _OTHER_NAMES = {
 }
 
 
-def read_ground_table(path: Path, notes: list[str], *, may_be_empty: bool = False) -> Table:
-    """The columns of a table of points, for `known_points`.
+def read_ground_table(path: Path, crs: str, notes: list[str], *, may_be_empty: bool = False) -> Table:
+    """The columns of a table of points in a CRS, for `known_points`.
 
     ``point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m,role`` and ``target_radius_m``, or names of other programs: of
     Metashape ``Enable`` is 1 for control and 0 for a check point, one accuracy is for all axes. Without a role all
@@ -60,21 +62,23 @@ def read_ground_table(path: Path, notes: list[str], *, may_be_empty: bool = Fals
     """
     skip = _remarks(path)
     header = column_names_of(path, skip)
-    columns = [replace(column, other_names=(*column.other_names, *_same(header, column.name))) for column in _COLUMNS]
+    columns = [
+        _as_headed(column, header, crs) for column in _COLUMNS if column.name != "enabled" or "role" not in header
+    ]
     table = read_table(path, columns, notes, may_be_empty=may_be_empty, skip=skip)
-    values = dict(table.values)
-    if "role" not in table and "enabled" in table:
+    values: dict[str, NDArray[Any]] = dict.fromkeys(_SIGMAS, np.full(len(table), np.nan))
+    if "accuracy" in table:
+        values |= dict(zip(_SIGMAS, _accuracies(table).T, strict=True))
+    if "level_accuracy" in table:
+        values |= dict.fromkeys(_SIGMAS[:2], table["level_accuracy"])
+    if "enabled" in table:
         enabled = np.isin(table["enabled"].astype(str), ("1", "True", "true"))
         values["role"] = np.where(enabled, "control", "check").astype(object)
     elif "role" not in table:
         values["role"] = np.full(len(table), "control", dtype=object)
         if len(table):
             notes.append(f"{path.name}: no column role: all points are control")
-    if "accuracy" in table:
-        values |= dict(zip(_SIGMAS, _accuracies(table).T, strict=True))
-    if "level_accuracy" in table:
-        values |= dict.fromkeys(_SIGMAS[:2], table["level_accuracy"])
-    return replace(table, values=dict.fromkeys(_SIGMAS, np.full(len(table), np.nan)) | values)
+    return replace(table, values=values | dict(table.values))
 
 
 def _remarks(path: Path) -> int:
@@ -87,9 +91,22 @@ def _remarks(path: Path) -> int:
         return sum(1 for _ in remarks)
 
 
-def _same(header: Sequence[str], name: str) -> list[str]:
-    """Names in a header that mean the same as that of a column."""
-    return [other for other in header if other != name and _plain(other) in _OTHER_NAMES.get(name, ())]
+def _as_headed(column: Column, header: Sequence[str], crs: str) -> Column:
+    """The column under the name that a header has for it, where that has none of ours."""
+    if set(column.names) & set(header):
+        return column
+    others = list(_OTHER_NAMES.get(column.name, ()))
+    if _is_geographic(crs):
+        others.sort(key=lambda name: name not in _LONGITUDE + _LATITUDE)  # of lists that have both
+    found = sorted((others.index(_plain(name)), name) for name in header if _plain(name) in others)
+    return replace(column, other_names=(*column.other_names, found[0][1])) if found else column
+
+
+def _is_geographic(crs: str) -> bool:
+    try:
+        return crs == GEOGRAPHIC or LocalFrame(0.0, 0.0, 0.0, crs).units[0] == "deg"
+    except CrsError:  # told where the points are brought into it
+        return False
 
 
 def _plain(name: str) -> str:
@@ -104,7 +121,7 @@ def _accuracies(table: Table) -> NDArray[np.float64]:
             parts = [float(part) for part in text.split("/") if part]
         except ValueError:
             parts = [np.nan]
-        if len(parts) > 3 or any(not part >= 0.0 for part in parts):
+        if len(parts) > 3 or any(not 0.0 <= part < np.inf for part in parts):
             bad = np.arange(len(table)) == row
             table.refuse(bad, "accuracy", lambda i: f"{table['accuracy'][i]!r}, wanted metres")
         if parts:
@@ -132,7 +149,7 @@ def read_ground_points(
     ------
     UserError : ``file:line: column: what is wrong``, a CRS that PROJ does not know
     """
-    table = read_ground_table(path, notes)
+    table = read_ground_table(path, crs, notes)
     xyz = table.stack("X_m", "Y_m", "Z_m")
     whole = np.isfinite(xyz).all(axis=1)  # planimetric points may have no height
     try:

@@ -385,7 +385,7 @@ def _ground(folder: Path, crs: str, ellipsoid: Ellipsoid, notes: list[str]) -> t
         )
     table = Table(path, {})
     if path.is_file():
-        table = read_ground_table(path, notes, may_be_empty=True)
+        table = read_ground_table(path, crs, notes, may_be_empty=True)
     rows = len(table) if table.values else 0
     if not rows:
         notes.append("ground_points.csv: no points: the block stands on its orbits or polynomials alone")
