@@ -43,7 +43,7 @@ _POSES = ("lever_arm", "boresight", "position_sigma", "attitude_sigma", *_SENSOR
 #: Kind of input -> options (as attributes) that have an effect on it.
 GO_WITH: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("flight", "ties", "camera"), ()),
-    **dict.fromkeys(("sensors", "rtklib", "ros2"), _SENSORS),
+    **dict.fromkeys(("sensors", "rtklib", "grafnav", "ros2"), _SENSORS),
     **dict.fromkeys(("avirisng", "pos", "waypoint", "headwall", "resonon", "gpx"), _POSES),
     **dict.fromkeys(("avirisc", "csv"), (*_POSES, "crs")),
     "sbet": (*_POSES, "seconds_of_day", "accuracies"),

@@ -48,7 +48,9 @@ COLUMNS = ("time_s", *_VALUES, *(f"sigma_{name}" for name in _SIGMAS))
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "input", metavar="INPUT", help="recording, or sensor folder (imu.csv, gnss.csv or gnss.pos, platform.toml)"
+        "input",
+        metavar="INPUT",
+        help="recording, or sensor folder (imu.csv; gnss.csv, gnss.pos or gnss.txt; platform.toml)",
     )
     parser.add_argument("-o", "--output", metavar="DIR", help="folder for the results (default: INPUT/navigation)")
     parser.add_argument("--platform", metavar="FILE", help="platform.toml to use instead of the one in the folder")

@@ -45,7 +45,7 @@ _WRITTEN = (
 _OF_FOLDERS = {
     *("project.toml", "flight.toml", "platform.toml", "camera.json", "expected.json"),
     *("strips.csv", "trajectory.csv", "ground_points.csv", "image_points.csv"),
-    *("imu.csv", "gnss.csv", "gnss.pos", "attitude.csv"),
+    *("imu.csv", "gnss.csv", "gnss.pos", "gnss.txt", "attitude.csv"),
 }
 _LONGEST_TEXT = 1_000_000
 

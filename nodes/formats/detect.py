@@ -38,7 +38,7 @@ from .sbet import is_sbet, read_sbet
 from .scene_block import is_scene_block, read_scene_block
 from .scene_images import images_of_scenes, left_out, with_scene_images
 from .scene_recording import local_block
-from .sensor_folder import SensorFolder, positions_alone, read_sensor_folder
+from .sensor_folder import POSITIONS, SENSOR_FILES, SensorFolder, positions_alone, read_sensor_folder
 from .sensor_recording import sensor_extent, sensor_fixes, sensor_messages
 from .smrmsg import is_smrmsg
 from .tie_points import statistics, tie_point_messages
@@ -47,7 +47,7 @@ from .time_columns import same_day
 from .track import Accuracy, Mounting, NavigationTrack, frame_of, track_messages
 from .trajectory_csv import is_trajectory_csv, read_trajectory_csv
 from .vendor_poses import is_headwall, is_resonon, read_headwall, read_resonon
-from .waypoint import is_waypoint, read_waypoint
+from .waypoint import is_grafnav, is_waypoint, read_waypoint
 
 #: Times before this one, ns, are GPS seconds of the week whose day nobody has said.
 _NO_DAY_NS = (GPS_EPOCH_S + 2 * WEEK_S) * SECOND_NS
@@ -56,7 +56,7 @@ KINDS = {
     "flight": "flight folder (flight.toml)",
     "block": "block folder (camera.json, strips.csv, trajectory.csv, ground_points.csv, image_points.csv)",
     "scenes": "block of satellite scenes (project.toml with [scenes.NAME])",
-    "sensors": "sensor folder (imu.csv, gnss.csv or gnss.pos, attitude.csv)",
+    "sensors": "sensor folder (imu.csv, gnss.csv, gnss.pos or gnss.txt, attitude.csv)",
     "avirisng": "AVIRIS-NG line-by-line poses (angYYYYMMDDtHHMMSS_eph_att)",
     "avirisc": "AVIRIS-C ephemeris (fYYMMDDtNNpNNrNN..._eph)",
     "pos": "Applanix POS Export text",
@@ -67,6 +67,7 @@ KINDS = {
     "resonon": "Resonon poses (.lcf)",
     "gpx": "GPX track",
     "rtklib": "RTKLIB file of positions (.pos)",
+    "grafnav": "text of GrafNav (NovAtel Waypoint)",
     "ros2": "ROS 2 bag (folder with metadata.yaml, MCAP file or .db3 file) with NavSatFix, Imu and Image",
     "lines": "image lines: ENVI image with .hdr, TIFF, or with --raw plain values",
     "ties": "AVIRIS-NG tie points (GeoCal XML)",
@@ -139,7 +140,7 @@ def kind_of_path(path: Path) -> str:
             raise UserError(f"{path}: {other}")
         if is_block_folder(path):
             return "block"
-        if any((path / name).is_file() for name in ("imu.csv", "gnss.csv", "gnss.pos", "attitude.csv")):
+        if any((path / name).is_file() for name in SENSOR_FILES):
             return "sensors"
         if (path / "metadata.yaml").is_file():
             return "ros2"
@@ -168,7 +169,7 @@ def kind_of_path(path: Path) -> str:
     if is_pos_export(path):
         return "pos"
     if is_waypoint(path):
-        return "waypoint"
+        return "grafnav" if is_grafnav(path) else "waypoint"
     if is_rtklib(path):
         return "rtklib"
     if is_headwall(path):
@@ -244,7 +245,7 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
     if kind == "lines":
         return _image_alone(path, options)
     notes: list[str] = []
-    if kind in ("sensors", "rtklib", "ros2") or (kind == "gpx" and not has_attitudes(path)):
+    if kind in ("sensors", *POSITIONS, "ros2") or (kind == "gpx" and not has_attitudes(path)):
         topics = _image_topics(options) if kind == "ros2" else None
         folder = options.folder
         if kind == "gpx":
@@ -252,7 +253,9 @@ def read_any(path: Path, kind: str | None = None, options: Options | None = None
             notes.extend(positions.notes)
             messages = position_messages(positions, options.accuracy, notes, "import")
         elif topics is None:
-            folder = folder or (positions_alone if kind == "rtklib" else read_sensor_folder)(path)
+            folder = folder or (
+                positions_alone(path, kind, options.day) if kind in POSITIONS else read_sensor_folder(path)
+            )
             messages = sensor_messages(folder, notes, grade=options.grade)
         else:
             messages = _with_noise(ros2_messages(path, notes, given=topics), options.grade)

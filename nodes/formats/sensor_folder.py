@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,15 @@ from .keys import Keys, read_toml
 from .rtklib import read_rtklib
 from .table import Column, Table, read_table, separator_of
 from .track import MOST_BORESIGHT_DEG, MOST_LEVER_ARM_M
+from .waypoint import read_grafnav
 
 Array = NDArray[np.floating]
+
+#: Files with fixes: our own, of RTKLIB, of GrafNav; and files that make a folder one of sensors.
+GNSS_FILES = ("gnss.csv", "gnss.pos", "gnss.txt")
+SENSOR_FILES = ("imu.csv", *GNSS_FILES, "attitude.csv")
+#: Kinds of files of positions alone.
+POSITIONS = ("rtklib", "grafnav")
 
 FORCE = ("fx_m_s2", "fy_m_s2", "fz_m_s2")
 RATE = ("wx_rad_s", "wy_rad_s", "wz_rad_s")
@@ -101,7 +109,7 @@ class SensorFolder:
     time_s : (n,) stamps of the inertial samples, or None without imu.csv
     rotation, force : (n, 3) angular rates (rad/s) and specific forces (m/s^2), or increments (rad, m/s)
     increments : whether they are increments
-    gnss : fixes, or None without gnss.csv and gnss.pos
+    gnss : fixes, or None without one of `GNSS_FILES`
     attitude : or None without attitude.csv
     platform : of platform.toml, or defaults
     notes : remarks on reading
@@ -189,32 +197,37 @@ def read_sensor_folder(path: str | Path, platform_file: Path | None = None) -> S
     """
     folder = Path(path)
     if not folder.is_dir():
-        raise UserError(f"{folder}: not a folder, wanted one with imu.csv and gnss.csv (or gnss.pos)")
+        raise UserError(f"{folder}: not a folder, wanted one with imu.csv and gnss.csv (or gnss.pos, gnss.txt)")
     notes: list[str] = []
     time, rotation, force, increments = _read_imu(folder / "imu.csv", notes)
-    rtklib = folder / "gnss.pos"
-    if rtklib.is_file() and (folder / "gnss.csv").is_file():
-        raise UserError(f"{folder}: gnss.csv and gnss.pos, wanted one of them")
-    gnss = read_rtklib(rtklib, notes) if rtklib.is_file() else _read_gnss(folder / "gnss.csv", notes)
+    of_fixes = [name for name in GNSS_FILES if (folder / name).is_file()]
+    if len(of_fixes) > 1:
+        raise UserError(f"{folder}: {' and '.join(of_fixes)}, wanted one of them")
+    file = (of_fixes or [SensorFolder.gnss_file])[0]
+    if file == "gnss.pos":
+        gnss: GnssData | None = read_rtklib(folder / file, notes)
+    elif file == "gnss.txt":
+        gnss = read_grafnav(folder / file, notes)
+    else:
+        gnss = _read_gnss(folder / file, notes)
     attitude = _read_attitude(folder / "attitude.csv", notes)
     if gnss is not None and attitude is not None:
         notes.extend(f"attitude.csv: {remark}" for remark in _remarks(gnss, attitude))
     platform = read_platform(platform_file or folder / "platform.toml", notes)
     if platform.initial is None and attitude is not None and time is not None:
         platform = replace(platform, initial=_initial_of(attitude, float(time.min())))
-    file = rtklib.name if rtklib.is_file() else SensorFolder.gnss_file
     return SensorFolder(folder, time, rotation, force, increments, gnss, attitude, platform, notes, gnss_file=file)
 
 
-def positions_alone(path: Path) -> SensorFolder:
-    """RTKLIB positions as a sensor folder that has nothing else.
+def positions_alone(path: Path, kind: str, day: date | None) -> SensorFolder:
+    """Positions (`POSITIONS`) as a sensor folder that has nothing else; the day where the file has none.
 
     Raises
     ------
-    UserError : as `read_rtklib`
+    UserError : as `read_rtklib` and `read_grafnav`
     """
     notes = [f"{path.name}: positions without attitudes: they become sensor/gnss, not poses"]
-    gnss = read_rtklib(path, notes)
+    gnss = read_rtklib(path, notes) if kind == "rtklib" else read_grafnav(path, notes, day)
     return SensorFolder(path.parent, None, None, None, False, gnss, None, Platform(), notes, gnss_file=path.name)
 
 

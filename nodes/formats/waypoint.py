@@ -1,4 +1,6 @@
-"""Text of NovAtel's Waypoint programs (Inertial Explorer): a header in words, names of columns, their units, pose rows.
+"""Text of NovAtel's Waypoint programs: a header in words, names of columns, their units, then a row a pose or position.
+
+Inertial Explorer writes poses, GrafNav positions of the antenna.
 
 Which columns there are, in what order and in what units, the user chooses when he exports. Angles are taken as those of
 other navigation files: roll positive with the right side down, pitch with the nose up, heading clockwise from north.
@@ -8,7 +10,7 @@ Poses that contradict this by their course and turns are noted, as of any file.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date, datetime, timedelta
 from itertools import pairwise
@@ -17,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...solver.navigation.inertial_data import GnssData
 from ..errors import UserError
 from .gps_time import DAY_S, WEEK_S, gps_week
 from .number_rows import numbered_lines, numbers_of
@@ -48,16 +51,12 @@ _NAMES = {
     "sd_roll": ("rollsd",),
     "sd_pitch": ("pitchsd", "ptchsd"),
     "sd_heading": ("hdngsd", "headingsd"),
+    "quality": ("q",),
 }
-#: Quantities that have to be there, as Waypoint calls them.
-_WANTED = {
-    "lat": "Latitude",
-    "lon": "Longitude",
-    "height": "H-Ell",
-    "roll": "Roll",
-    "pitch": "Pitch",
-    "heading": "Heading",
-}
+#: Quantities that have to be there, as Waypoint calls them: of positions, of poses, and the accuracies of positions.
+_PLACE = {"lat": "Latitude", "lon": "Longitude", "height": "H-Ell"}
+_POSE = _PLACE | {"roll": "Roll", "pitch": "Pitch", "heading": "Heading"}
+_ACCURACY = {"sd_n": "SDNorth", "sd_e": "SDEast", "sd_u": "SDHeight"}
 _METRES = ("height", "sd_n", "sd_e", "sd_u", "sd_level")
 _ANGLES = ("lat", "lon", "roll", "pitch", "heading", "sd_roll", "sd_pitch", "sd_heading")
 #: Unit of an angle of one number -> degrees.
@@ -83,12 +82,24 @@ class _Column:
 
 def is_waypoint(path: Path) -> bool:
     """Whether a text has a row of names with a row of units below it, as Waypoint writes them."""
+    return bool(_names(path))
+
+
+def is_grafnav(path: Path) -> bool:
+    """Whether it is one without attitudes, as GrafNav writes it."""
+    names = _names(path)
+    return bool(names) and not names & {"roll", "pitch", "heading"}
+
+
+def _names(path: Path) -> set[str]:
+    """Names of the columns; empty where a file is no text of Waypoint."""
     with open(path, "rb") as file:
         head = file.read(1 << 14)
     if b"\0" in head:
-        return False
+        return set()
     lines = [line for line in head.decode("utf-8-sig", "replace").splitlines() if line.strip()]
-    return _table_at(lines) is not None
+    at = _table_at(lines)
+    return set() if at is None else {_plain(word) for word in _words(lines[at])}
 
 
 def read_waypoint(path: Path, day: date | None = None) -> NavigationTrack:
@@ -102,6 +113,40 @@ def read_waypoint(path: Path, day: date | None = None) -> NavigationTrack:
     UserError : a column that is missing, a unit that is not known, a value that is malformed (with its line), another
         day
     """
+    notes: list[str] = []
+    value, time_ns = _read(path, day, _POSE, notes)
+    track = NavigationTrack(
+        path.stem,
+        time_ns,
+        np.column_stack([value[name] for name in ("lat", "lon", "height")]),
+        np.radians(np.column_stack([value[name] for name in ("roll", "pitch", "heading")])),
+        *_sigmas(path, value, notes),
+        notes=tuple(notes),
+    )
+    return check_units(checked(track, path), path, {"lat": "Latitude", "lon": "Longitude", "heading": "Heading"})
+
+
+def read_grafnav(path: Path, notes: list[str], day: date | None = None) -> GnssData:
+    """Positions of the antenna of a text of GrafNav, with their accuracies; the day as of `read_waypoint`.
+
+    Raises
+    ------
+    UserError : as `read_waypoint`
+    """
+    value, time_ns = _read(path, day, _PLACE | _ACCURACY, notes)
+    if "quality" in value:
+        numbers, counts = np.unique(value["quality"], return_counts=True)
+        shares = ", ".join(f"{n / len(time_ns):.1%} of quality {q:g}" for q, n in zip(numbers, counts, strict=True))
+        notes.append(f"{path.name}: {len(time_ns)} positions: {shares} (1 is the best)")
+    lat, lon = np.radians(value["lat"]), np.radians(value["lon"])
+    sigma = np.column_stack([value[name] for name in _ACCURACY])
+    return GnssData(time_ns * 1e-9, lat, lon, value["height"], sigma)
+
+
+def _read(
+    path: Path, day: date | None, wanted: Mapping[str, str], notes: list[str]
+) -> tuple[dict[str, Array], NDArray[np.int64]]:
+    """Values by quantity, (n,) each, in degrees and metres, and UTC (n,) in ns since the Unix epoch."""
     lines = numbered_lines(path)
     at = _table_at([text for _, text in lines])
     if at is None:
@@ -112,24 +157,22 @@ def read_waypoint(path: Path, day: date | None = None) -> NavigationTrack:
         rows.pop()
     columns, total = _columns(lines[at][1], lines[at + 1][1], rows[0][1] if rows else [])
     found = {quantity: c for quantity, names in _NAMES.items() for c in columns if _plain(c.name) in names}
-    for quantity, name in _WANTED.items():
+    if "roll" in wanted:
+        found.pop("quality", None)  # of solutions of GNSS
+    if "sd_level" in found:  # stands for both
+        wanted = {quantity: name for quantity, name in wanted.items() if quantity not in ("sd_n", "sd_e")}
+    for quantity, name in wanted.items():
         if quantity not in found:
             other = " (H-MSL counts from a geoid)" if quantity == "height" else ""
-            raise UserError(f"{path}:{names_at}: {name}: column missing, wanted {', '.join(_WANTED.values())}{other}")
+            raise UserError(f"{path}:{names_at}: {name}: column missing, wanted {', '.join(wanted.values())}{other}")
     wrong = [f"{path}:{number}: {len(words)} values, wanted {total}" for number, words in rows if len(words) != total]
     if wrong:
         raise UserError(one_line(wrong[:MOST_PROBLEMS], max(len(wrong) - MOST_PROBLEMS, 0)))
     value = _values(path, names_at, rows, found)
-    notes = _remarks(path, " ".join(text.strip() for _, text in lines[:at]))
-    track = NavigationTrack(
-        path.stem,
-        _times(path, names_at, rows, found, day, notes),
-        np.column_stack([value[name] for name in ("lat", "lon", "height")]),
-        np.radians(np.column_stack([value[name] for name in ("roll", "pitch", "heading")])),
-        *_sigmas(path, value, notes),
-        notes=tuple(notes),
-    )
-    return check_units(checked(track, path), path, {"lat": "Latitude", "lon": "Longitude", "heading": "Heading"})
+    if "sd_level" in value and "sd_n" not in value:
+        value |= dict.fromkeys(("sd_n", "sd_e"), value["sd_level"] / np.sqrt(2.0))
+    notes += _remarks(path, " ".join(text.strip() for _, text in lines[:at]))
+    return value, _times(path, names_at, rows, found, day, notes)
 
 
 def _table_at(lines: Sequence[str]) -> int | None:
@@ -186,7 +229,7 @@ def _values(path: Path, names_at: int, rows: _Rows, found: dict[str, _Column]) -
             raise UserError(f"{path}:{names_at + 1}: {what}, wanted {' or '.join(known)}")
     place: dict[str, int] = {}
     for quantity, column in found.items():
-        if quantity in _ANGLES or quantity in _METRES:
+        if quantity in (*_ANGLES, *_METRES, "quality"):
             place |= {column.name + _PARTS[k]: column.first + k for k in range(column.words)}
     numbers = dict(zip(place, numbers_of(path, rows, place).T, strict=True))
     out: dict[str, Array] = {}
@@ -201,8 +244,6 @@ def _values(path: Path, names_at: int, rows: _Rows, found: dict[str, _Column]) -
 
 def _sigmas(path: Path, value: dict[str, Array], notes: list[str]) -> tuple[Array | None, Array | None]:
     """Of north, east and up, m, and of roll, pitch and heading, rad, (n, 3) each; None where the file lacks some."""
-    if "sd_level" in value and "sd_n" not in value:
-        value = value | dict.fromkeys(("sd_n", "sd_e"), value["sd_level"] / np.sqrt(2.0))
     position = [value[name] for name in ("sd_n", "sd_e", "sd_u") if name in value]
     attitude = [value[name] for name in ("sd_roll", "sd_pitch", "sd_heading") if name in value]
     for given, what, wanted in (

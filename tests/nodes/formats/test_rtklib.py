@@ -189,6 +189,6 @@ def test_a_sensor_folder_takes_them_in_place_of_gnss_csv(tmp_path, capsys):
             other.rename(folder / "gnss.pos")
         assert main(["navigate", str(folder), "-o", str(tmp_path / name), "--no-page"]) == 0
         found.append(np.loadtxt(tmp_path / name / "trajectory.csv", delimiter=",", skiprows=1))
-    np.testing.assert_allclose(found[0][:, 1:3], found[1][:, 1:3], atol=1e-8)
-    np.testing.assert_allclose(found[0][:, 3], found[1][:, 3], atol=1e-3)
+    np.testing.assert_allclose(found[0][:, 1:3], found[1][:, 1:3], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(found[0][:, 3], found[1][:, 3], rtol=0, atol=1e-3)
     assert f"gnss.pos: {len(rows)} positions: 100.0% fixed" in capsys.readouterr().err

@@ -11,7 +11,8 @@ from tracks import straight_track, waypoint_text
 
 from triline.nodes.cli import main
 from triline.nodes.errors import UserError
-from triline.nodes.formats.detect import kind_of_path
+from triline.nodes.formats.detect import kind_of_path, read_any
+from triline.nodes.formats.sensor_folder import read_sensor_folder
 from triline.nodes.formats.waypoint import read_waypoint
 from triline.nodes.recording.access import Recording
 
@@ -160,3 +161,54 @@ def test_a_sunday_night_is_none_of_the_monday_that_is_given(tmp_path):
     sunday = replace(track, time_ns=track.time_ns - 13 * 3600 * 10**9)  # 2020-05-31, 23:00
     path = written(tmp_path, "GPSTime (sec)", *DMS, *ANGLES, track=sunday)
     check(read_waypoint(path, date(2020, 6, 1)), sunday)
+
+
+# ---- GrafNav
+
+FIXES = ("Week (weeks)", "GPSTime (sec)", *DMS, "Q", "SDEast (m)", "SDNorth (m)", "SDHeight (m)", "COG (deg)")
+
+
+def grafnav(path, columns=FIXES, sigmas="2 0.02 0.01 0.03"):
+    """Positions of `straight_track`; quality and accuracies stand in the last columns but one."""
+    lines = waypoint_text(straight_track(), *columns, header=HEADER).splitlines()
+    width = len(sigmas.split()) + 1
+    rows = [" ".join([*line.split()[:-width], *sigmas.split(), "0"]) for line in lines[-50:]]
+    path.write_text("\n".join([*lines[:-50], *rows]) + "\n")
+    return path
+
+
+def test_positions_of_grafnav_become_fixes_with_their_accuracies(tmp_path):
+    path = grafnav(tmp_path / "ppk.txt")
+    assert kind_of_path(path) == "grafnav"
+    imported = read_any(path)
+    messages = [message for message in imported.messages if message.topic == "sensor/gnss"]
+    bodies, track = [message.body for message in messages], straight_track()
+    assert [message.stamp_ns for message in messages] == pytest.approx(track.time_ns.tolist(), abs=1_000_000, rel=0)
+    place = np.array([(body.latitude, body.longitude, body.altitude) for body in bodies])
+    np.testing.assert_allclose(place[:, :2], track.geodetic[:, :2], rtol=0, atol=3e-8)
+    np.testing.assert_allclose(place[:, 2], track.geodetic[:, 2], rtol=0, atol=1e-3)
+    variances = [bodies[7].position_covariance[i] for i in (0, 4, 8)]  # east, north, up
+    assert variances == pytest.approx([4e-4, 1e-4, 9e-4])
+    assert "ppk.txt: 50 positions: 100.0% of quality 2 (1 is the best)" in imported.notes
+
+
+def test_one_accuracy_in_level_and_none_at_all(tmp_path):
+    level = (*FIXES[:6], "SDHoriz (m)", "SDHeight (m)", "COG (deg)")
+    imported = read_any(grafnav(tmp_path / "ppk.txt", level, "1 0.02 0.03"))
+    fix = next(message.body for message in imported.messages if message.topic == "sensor/gnss")
+    assert [fix.position_covariance[i] for i in (0, 4, 8)] == pytest.approx([2e-4, 2e-4, 9e-4])
+    with pytest.raises(UserError, match=r"ppk\.txt:\d+: SDNorth: column missing, wanted Latitude.*SDHeight"):
+        read_any(grafnav(tmp_path / "ppk.txt", (*FIXES[:6], "COG (deg)"), "1"))
+
+
+def test_a_sensor_folder_takes_fixes_of_grafnav(tmp_path):
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    grafnav(folder / "gnss.txt")
+    found = read_sensor_folder(folder)
+    assert found.gnss is not None and found.gnss_file == "gnss.txt" and kind_of_path(folder) == "sensors"
+    np.testing.assert_allclose(found.gnss.time_s, straight_track().time_ns * 1e-9, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(found.gnss.sigma_ned_m, np.tile([0.01, 0.02, 0.03], (50, 1)))
+    (folder / "gnss.csv").write_text("time_s\n")
+    with pytest.raises(UserError, match=r"gnss\.csv and gnss\.txt, wanted one of them"):
+        read_sensor_folder(folder)
