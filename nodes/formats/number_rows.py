@@ -1,4 +1,4 @@
-"""Texts with rows of numbers and no commas: their lines with their numbers, and the values with where one is wrong."""
+"""Texts whose rows are numbers: their lines that are not blank, and the values, with where one of them is wrong."""
 
 from __future__ import annotations
 

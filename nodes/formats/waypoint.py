@@ -169,8 +169,8 @@ def _read(
     if wrong:
         raise UserError(one_line(wrong[:MOST_PROBLEMS], max(len(wrong) - MOST_PROBLEMS, 0)))
     value = _values(path, names_at, rows, found)
-    if "sd_level" in value and "sd_n" not in value:
-        value |= dict.fromkeys(("sd_n", "sd_e"), value["sd_level"] / np.sqrt(2.0))
+    if "sd_level" in value:
+        value = dict.fromkeys(("sd_n", "sd_e"), value["sd_level"] / np.sqrt(2.0)) | value
     notes += _remarks(path, " ".join(text.strip() for _, text in lines[:at]))
     return value, _times(path, names_at, rows, found, day, notes)
 

@@ -192,11 +192,21 @@ def test_positions_of_grafnav_become_fixes_with_their_accuracies(tmp_path):
     assert "ppk.txt: 50 positions: 100.0% of quality 2 (1 is the best)" in imported.notes
 
 
-def test_one_accuracy_in_level_and_none_at_all(tmp_path):
-    level = (*FIXES[:6], "SDHoriz (m)", "SDHeight (m)", "COG (deg)")
-    imported = read_any(grafnav(tmp_path / "ppk.txt", level, "1 0.02 0.03"))
+@pytest.mark.parametrize(
+    ("columns", "sigmas", "wanted"),
+    [
+        (("SDHoriz (m)", "SDHeight (m)"), "1 0.02 0.03", [2e-4, 2e-4, 9e-4]),
+        (("SDNorth (m)", "SDHoriz (m)", "SDHeight (m)"), "1 0.01 0.02 0.03", [2e-4, 1e-4, 9e-4]),
+    ],
+    ids=["alone", "beside one of the two"],
+)
+def test_one_accuracy_in_level_stands_for_both(tmp_path, columns, sigmas, wanted):
+    imported = read_any(grafnav(tmp_path / "ppk.txt", (*FIXES[:6], *columns, "COG (deg)"), sigmas))
     fix = next(message.body for message in imported.messages if message.topic == "sensor/gnss")
-    assert [fix.position_covariance[i] for i in (0, 4, 8)] == pytest.approx([2e-4, 2e-4, 9e-4])
+    assert [fix.position_covariance[i] for i in (0, 4, 8)] == pytest.approx(wanted)
+
+
+def test_positions_without_accuracies_are_refused(tmp_path):
     with pytest.raises(UserError, match=r"ppk\.txt:\d+: SDNorth: column missing, wanted Latitude.*SDHeight"):
         read_any(grafnav(tmp_path / "ppk.txt", (*FIXES[:6], "COG (deg)"), "1"))
 
