@@ -275,6 +275,11 @@ def read_flight(folder: Path, live: bool | None = None, instead: Instead | None 
             flight.notes.append(f"{FILE}: {keys.name('id')}: {id!r} has no images: the recording has no lines of it")
             continue
         flight.attempt(lambda keys=keys: (_announced if live else _strip)(flight, keys))
+    places = flight.places_deg
+    if places is None and flight.origin_deg is not None:
+        places = np.array([flight.origin_deg])
+    if flight.crs and flight.control is None and places is not None:
+        _tell_outside(flight, f"{FILE}: the flight", places, "is that the CRS of the results?")
     if given is not None:
         flight.attempt(lambda: _open(flight, replace(given, day=flight.day)))
     elif not strips and not live and flight.kind != "ros2":
@@ -390,11 +395,13 @@ def _datum(keys: Keys) -> str:
     return value
 
 
-def _beside(flight: Flight, keys: Keys, key: str, text: str) -> Path:
-    """A file by its name in the folder."""
+def _beside(flight: Flight, keys: Keys, key: str, text: str, *, or_folder: bool = False) -> Path:
+    """A file, or a folder where that may be one, by its name in the folder."""
     path = flight.folder / text
     if not is_there(path):
         raise UserError(f"{keys.path}: {keys.name(key)}: no {text[:200]} in the folder")
+    if path.is_dir() and not or_folder:
+        raise UserError(f"{keys.path}: {keys.name(key)}: {text[:200]!r} is a folder, wanted a file")
     return path
 
 
@@ -461,7 +468,7 @@ def _navigation(flight: Flight, keys: Keys, live: bool, instead: Instead) -> Non
     elif not keys.has("file"):
         raise keys.refuse("file", "poses or sensors of the flight; or, for `triline fly`, [[sensor]] tables")
     else:
-        path = _beside(flight, keys, "file", keys.text("file"))
+        path = _beside(flight, keys, "file", keys.text("file"), or_folder=True)
         kind = kind or kind_of_path(path)
         if kind not in NAVIGATION:
             raise keys.refuse("file", f"poses or sensors, not a {KINDS[kind]}")
@@ -594,12 +601,17 @@ def _refuse_far(flight: Flight, name: str, control_deg: Array) -> None:
                 f"wanted coordinates in flight.crs ({flight.crs})"
             )
         return
-    lat, lon = np.median(control_deg, axis=0)
+    _tell_outside(flight, f"{name}:", control_deg, "are its coordinates in that CRS?")
+
+
+def _tell_outside(flight: Flight, name: str, places_deg: Array, ask: str) -> None:
+    """A note where places (n, 2) are outside of the area that the CRS is made for."""
+    lat, lon = np.median(places_deg, axis=0)
     outside, area = outside_area(flight.crs, lat, lon)
     if outside > OUTSIDE_DEG:
         flight.notes.append(
-            f"{name}: lies at about {lat:.1f}, {lon:.1f} deg, {outside:.0f} deg outside of the area of flight.crs "
-            f"({flight.crs}: {area}): are its coordinates in that CRS?"
+            f"{name} lies at about {lat:.1f}, {lon:.1f} deg, {outside:.0f} deg outside of the area of flight.crs "
+            f"({flight.crs}: {area}): {ask}"
         )
 
 
@@ -615,10 +627,18 @@ def _announced(flight: Flight, keys: Keys) -> None:
     if not keys.has("first_time") and not keys.has("line_rate_hz"):
         flight.notes.append(f"{FILE}: {keys.name('id')}: {id!r} has no first_time: it begins with its first line")
         return
+    (_, first_ns), rate_hz = _first_time(flight, keys), keys.number("line_rate_hz", positive=True)
+    flight.announced.append((id, first_ns, rate_hz))
+
+
+def _first_time(flight: Flight, keys: Keys) -> tuple[str, int]:
+    """In ISO 8601, and UTC in ns since the Unix epoch; what has no time zone is UTC, with a note."""
     value = keys.raw("first_time")
     text = value.isoformat() if hasattr(value, "isoformat") else keys.text("first_time")
-    rate_hz = keys.number("line_rate_hz", positive=True)
-    flight.announced.append((id, instant_ns(text, f"{keys.path}: {keys.name('first_time')}"), rate_hz))
+    time_ns = instant_ns(text, f"{keys.path}: {keys.name('first_time')}")
+    if not re.search(r"(Z|[-+]\d\d:?(\d\d)?)\s*$", text[10:]):
+        flight.notes.append(f"{FILE}: {keys.name('first_time')}: {text} has no time zone, taken as UTC")
+    return text, time_ns
 
 
 def _strip(flight: Flight, keys: Keys) -> None:
@@ -644,9 +664,7 @@ def _strip(flight: Flight, keys: Keys) -> None:
     times = _beside(flight, keys, "line_times", keys.text("line_times")) if keys.has("line_times") else None
     first = None
     if keys.has("first_time") or keys.has("line_rate_hz"):
-        value = keys.raw("first_time")
-        text = value.isoformat() if hasattr(value, "isoformat") else keys.text("first_time")
-        instant_ns(text, f"{keys.path}: {keys.name('first_time')}")  # an error names the key, not an option
+        text, _ = _first_time(flight, keys)
         first = (text, keys.number("line_rate_hz", positive=True))
     span = keys.numbers("grey_range", 2) if keys.has("grey_range") else None
     if span is not None and span[0] >= span[1]:

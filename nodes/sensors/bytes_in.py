@@ -24,13 +24,16 @@ def check_address(text: str, folder: Path) -> str:
 
     Raises
     ------
-    ValueError : not one of serial, tcp, udp, file; no port
+    ValueError : what was wanted: one of serial, tcp, udp, file; a port; a file where there is a folder
     """
     kind, colon, rest = text.partition(":")
     if not colon or not rest.strip("/"):
         raise ValueError(WANTED)
     if kind == "file":
-        return f"file:{(folder / rest).resolve()}"
+        path = (folder / rest).resolve()
+        if path.is_dir():
+            raise ValueError("a file, not a folder")
+        return f"file:{path}"
     if kind == "serial":
         return text
     if kind in ("tcp", "udp"):

@@ -265,6 +265,46 @@ def test_control_that_is_not_where_its_crs_is_used_is_told(folder, stated, place
     assert [refused in problem for problem in flight.problems] == [True] * (refused is not None)
 
 
+@pytest.mark.parametrize(("crs", "noted"), [("EPSG:32632", 0), ("EPSG:32732", 1), ("EPSG:32756", 1)])
+def test_an_origin_that_is_not_where_the_crs_is_used_is_told(folder, crs, noted):
+    """Without control a flight in another hemisphere than its CRS was complete without a word."""
+    toml = TOML.replace("[flight]", "[flight]\norigin_deg = [47.9, 11.1]").replace("EPSG:32632", crs)
+    (folder / "flight.toml").write_text(toml)
+    told = [note for note in read_flight(folder, live=True).notes if "outside of the area of flight.crs" in note]
+    assert len(told) == noted and all("flight.toml: the flight lies at about 47.9, 11.1 deg" in note for note in told)
+
+
+@pytest.mark.parametrize(
+    ("time", "noted"),
+    [
+        ("2026-11-22T09:30:00", True),
+        ('"2026-11-22 09:30:00.5"', True),
+        ("2026-11-22", True),
+        ("2026-11-22T10:30:00+01:00", False),
+        ('"2026-11-22T09:30:00Z"', False),
+    ],
+)
+def test_a_time_without_a_zone_is_utc_with_a_note(folder, time, noted):
+    """A crew that writes its local time was an hour off without a word."""
+    (folder / "flight.toml").write_text(TOML.replace("2026-11-22T09:30:00Z", time, 1))
+    flight = read_flight(folder, live=True)
+    told = [note for note in flight.notes if "has no time zone, taken as UTC" in note]
+    assert len(told) == noted and len(flight.announced) == 1 and not flight.problems
+
+
+def test_folders_where_files_are_wanted_are_told_by_their_key(folder):
+    (folder / "c").mkdir()
+    toml = TOML.replace("camera.json", "c").replace("file:gnss.nmea", "file:c") + '[control]\nfile = "c"\n'
+    (folder / "flight.toml").write_text(toml)
+    flight = read_flight(folder, live=True)
+    read_sensors(flight)
+    assert [problem.partition(": ")[2] for problem in flight.problems] == [
+        "camera.file: 'c' is a folder, wanted a file",
+        "control.file: 'c' is a folder, wanted a file",
+        "sensor[0].address: 'file:c', wanted a file, not a folder",
+    ]
+
+
 def connected(port: int) -> socket.socket:
     """A link to a program that is on the bus already and may not listen yet."""
     found: list[socket.socket] = []
