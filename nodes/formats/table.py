@@ -192,7 +192,7 @@ def read_table(
             usecols=list(label.values()),
             dtype={label[name]: str if column.kind == "text" else float for name, column in known.items()},
             keep_default_na=False,
-            na_values={label[n]: [""] for n, column in known.items() if column.kind != "text" and column.blank},
+            na_values={label[name]: [""] for name, column in known.items() if column.kind != "text"},
             **text,
             **exact,
         )
@@ -206,6 +206,11 @@ def read_table(
         problems = _problems(path, known, skip)
         if problems:
             raise UserError(one_line(problems))
+    blank = _blank_rows(frame)
+    if blank.any():  # as spreadsheets leave them below the last row
+        if problems := _problems(path, known, skip):  # other columns have something there
+            raise UserError(one_line(problems))
+        frame = frame[~blank]
     values: dict[str, NDArray[Any]] = {}
     for name, column in known.items():
         if column.kind == "text":
@@ -222,6 +227,15 @@ def read_table(
         raise UserError(f"{path}: no rows below the header, wanted at least one")
     headed = {column.name: name for name, column in known.items() if name != column.name}
     return Table(path, values, headed, skip=skip)
+
+
+def _blank_rows(frame: Any) -> NDArray[np.bool_]:
+    """Rows of pandas (n,) in which all columns that are read are empty."""
+    blank = np.ones(len(frame), dtype=bool)
+    for name in sorted(frame, key=lambda name: frame[name].dtype != float):  # numbers are looked through faster
+        if blank.any():
+            blank &= (frame[name].isna() | (frame[name] == "")).to_numpy()
+    return blank
 
 
 def write_table(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]], formats: Mapping[str, str]) -> None:

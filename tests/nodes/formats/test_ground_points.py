@@ -100,6 +100,19 @@ def test_other_names_count_where_ours_are_not_there_and_the_others_are_ignored(t
         assert notes[:3] == [f"both.csv: column {name!r} is not known and was ignored" for name in ignored]
 
 
+def test_empty_rows_as_spreadsheets_leave_them_are_none(tmp_path):
+    first, empty, row = LISTS["a spreadsheet"], ";;;;;;\r\n", "P2;691001,5;5334000,2;512,3;0,01;0,02;0,03\r\n"
+    points, place, _, _ = read(tmp_path / "control.csv", first + empty + row + empty + ";;\r\n")
+    assert points.id == ("P1", "P2")
+    np.testing.assert_allclose(place[0], [*PLACE, 512.3], rtol=0, atol=1e-8)
+    with pytest.raises(UserError, match=r"control\.csv:4: E: '69a' is not a number"):  # lines count as in the file
+        read(tmp_path / "control.csv", first + empty + row.replace("691001,5", "69a"))
+    with pytest.raises(UserError, match=r"control\.csv:4: Name: P1 comes twice"):
+        read(tmp_path / "control.csv", first + empty + row.replace("P2", "P1"))
+    with pytest.raises(UserError, match=r"control\.csv:3: Name: missing, wanted a name"):  # not empty in another column
+        read(tmp_path / "control.csv", first.replace("\r\n", ";Code\r\n", 1) + ";;;;;;;tree\r\n")
+
+
 @pytest.mark.parametrize("what", BAD)
 def test_a_list_that_cannot_be_read_is_told_by_its_line(tmp_path, what):
     text, wanted = BAD[what]
