@@ -34,7 +34,7 @@ from .image_cubes import cubes_of, is_pattern
 from .image_lines import ImageStrip, LinesGiven, open_strips
 from .keys import Keys, is_there, read_toml
 from .line_time_files import times_beside
-from .projection import missing_grids, off_without_grids, unknown_heights, with_heights
+from .projection import LONGEST_NAME, missing_grids, off_without_grids, unknown_heights, with_heights
 from .sensor_folder import SensorFolder, read_grade, read_sensor_folder, refuse_mounting
 from .sensor_recording import sensor_extent, some
 from .time_columns import instant_ns
@@ -46,8 +46,6 @@ FAR_M = 50e3
 #: Control that lies farther outside of the area of its CRS, degrees, is likely to be in another one: maps are used in
 #: neighbouring zones, too.
 OUTSIDE_DEG = 5.0
-#: A CRS of more characters is told by its name.
-LONGEST_CRS = 60
 #: Images of a strip that are named where they are missing.
 MISSING_SHOWN = 3
 #: What `navigation.file` may be.
@@ -356,7 +354,7 @@ def _general(flight: Flight, keys: Keys) -> None:
     if grids:
         off = off_without_grids(whole)
         key = "vertical_datum" if "heights" in off else "crs"
-        shown = whole if len(whole) < LONGEST_CRS else known_crs(whole).name
+        shown = whole if len(whole) < LONGEST_NAME else known_crs(whole).name
         what = f"PROJ lacks the grid {', '.join(grids[:3])} for {shown!r}: {off}"
         flight.problems.append(f"{keys.path}: flight.{key}: {what} (`projsync --file {grids[0]}` fetches it)")
     elif unknown := unknown_heights(whole):

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from ...solver.adjustment.block_data import KnownPoints
 from ...solver.adjustment.network import ROLES
-from ...solver.geometry.frames import GEOGRAPHIC, CrsError, Frame, LocalFrame
+from ...solver.geometry.frames import GEOGRAPHIC, CrsError, Frame, LocalFrame, known_crs
 from ..errors import UserError
 from .place_columns import PLACE, check_place_units, place_column, to_local
+from .projection import LONGEST_NAME
 from .table import Column, Table, column_names_of, read_table
 
 _SIGMAS = tuple(f"sigma_{name}" for name in PLACE)
@@ -30,6 +31,10 @@ _COLUMNS = (
     Column("level_accuracy", optional=True, blank=True, low=0.0),
     Column("enabled", "text", optional=True, choices=("1", "0", "True", "False", "true", "false")),
 )
+#: Places by the CRS that a list states and by the project's lie so close, m, in level and in height. Tuned: datum
+#: shifts of the same system in two programs are some metres apart, models of the same geoid up to one.
+_SAME_PLACE_M, _SAME_HEIGHT_M = 10.0, 1.0
+_STATED_CRS = re.compile(r"#\s*CoordinateSystem:\s*(.*\S)")
 #: Names of columns in lists of other programs and of survey crews, in small letters without blanks, _ and #; the first
 #: that a list has is the one that counts.
 _EASTING = ("x", "e", "east", "easting", "x/east", "x/easting")
@@ -54,7 +59,8 @@ def read_ground_table(path: Path, crs: str, notes: list[str], *, may_be_empty: b
 
     ``point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m,role`` and ``target_radius_m``, or names of other programs: of
     Metashape ``Enable`` is 1 for control and 0 for a check point, one accuracy is for all axes. Without a role all
-    points are control, with a note. Lines of remarks (``# ...``) may stand above the header.
+    points are control, with a note. Lines of remarks (``# ...``) may stand above the header; a ``CoordinateSystem``
+    that they state must be the CRS.
 
     Raises
     ------
@@ -66,6 +72,7 @@ def read_ground_table(path: Path, crs: str, notes: list[str], *, may_be_empty: b
         _as_headed(column, header, crs) for column in _COLUMNS if column.name != "enabled" or "role" not in header
     ]
     table = read_table(path, columns, notes, may_be_empty=may_be_empty, skip=skip)
+    _refuse_other_crs(table, crs, notes)
     values: dict[str, NDArray[Any]] = dict.fromkeys(_SIGMAS, np.full(len(table), np.nan))
     if "accuracy" in table:
         values |= dict(zip(_SIGMAS, _accuracies(table).T, strict=True))
@@ -86,9 +93,47 @@ def _remarks(path: Path) -> int:
     names = {"point", *_OTHER_NAMES["point"]}
     with open(path, encoding="utf-8-sig", errors="replace") as file:
         remarks = takewhile(
-            lambda line: line.startswith("# ") and not names & set(map(_plain, re.split("[,;]", line))), file
+            lambda line: (
+                _STATED_CRS.match(line)
+                or (line.startswith("# ") and not names & set(map(_plain, re.split("[,;]", line))))
+            ),
+            file,
         )
         return sum(1 for _ in remarks)
+
+
+def _refuse_other_crs(table: Table, crs: str, notes: list[str]) -> None:
+    """Raise UserError where a remark above the header states another CRS than the points are taken to be in."""
+    with open(table.path, encoding="utf-8-sig", errors="replace") as file:
+        lines = [(n, found[1]) for n in range(table.skip) if (found := _STATED_CRS.match(file.readline()))]
+    whole = table.stack("X_m", "Y_m", "Z_m")
+    whole = whole[np.isfinite(whole).all(axis=1)][:1]
+    if not lines or not len(whole) or crs == "local":
+        return
+    line, stated = lines[0]
+    where = f"{table.path}:{line + 1}: CoordinateSystem"
+    try:
+        told = known_crs(stated)
+    except CrsError:
+        notes.append(f"{table.path.name}: CoordinateSystem {stated[:40]!r} is none that PROJ knows, and was ignored")
+        return
+    project = "EPSG:4979" if crs == GEOGRAPHIC else crs
+    mine = known_crs(project)
+    wanted = repr(crs if len(crs) < LONGEST_NAME else mine.name)
+    if told.is_compound and not mine.is_compound:
+        what = f"heights are of {told.sub_crs_list[1].name!r}, wanted those above the ellipsoid, as {wanted} has them"
+        raise UserError(f"{where}: {what}")
+    try:
+        frame = LocalFrame.around(whole, project)
+        off = LocalFrame(frame.lat_deg, frame.lon_deg, 0.0, stated).from_crs(whole) - frame.from_crs(whole)
+    except CrsError:
+        if told.name == mine.name:  # the points are told where they are brought into it
+            return
+        raise UserError(f"{where}: {told.name!r}, wanted points in {wanted}") from None
+    away, above = float(np.hypot(*off[0, :2])), abs(float(off[0, 2]))
+    if away > _SAME_PLACE_M or (told.is_compound and above > _SAME_HEIGHT_M):
+        apart = f"{1e-3 * away:.0f} km" if away > 1e3 else f"{max(away, above):.0f} m"
+        raise UserError(f"{where}: points in {told.name!r} lie {apart} away, wanted them in {wanted}")
 
 
 def _as_headed(column: Column, header: Sequence[str], crs: str) -> Column:

@@ -16,7 +16,7 @@ from ..errors import UserError
 #: A CRS by the code of an authority.
 _CODE = re.compile(r"[A-Za-z]+:\d+")
 #: A CRS that is written with more letters (WKT) is told by its name.
-_LONGEST_NAME = 60
+LONGEST_NAME = 60
 
 
 class Projection:
@@ -183,7 +183,7 @@ def notes_of_map(crs: str, given: str = "local", what: str = "the map") -> list[
         return []
     grids = missing_grids(flat.to_string())
     off = f"{what} may be off by the datum shift, metres, all alike"
-    name = crs if len(crs) < _LONGEST_NAME else flat.name
+    name = crs if len(crs) < LONGEST_NAME else flat.name
     return [
         f"PROJ has no grid {', '.join(grids[:3])} here for {name!r}; {off} (`projsync --file {grid}` fetches it)"
         for grid in grids[:1]

@@ -9,7 +9,7 @@ from triline.nodes.formats.ground_points import read_ground_points
 
 UTM, LONLAT = "EPSG:32632", "EPSG:4326"
 PLACE = pyproj.Transformer.from_crs(UTM, LONLAT).transform(691000.5, 5334000.2)
-PROJCS = '# CoordinateSystem: PROJCS["WGS 84 / UTM zone 32N",GEOGCS["WGS 84",DATUM["WGS 1984"]]]'
+PROJCS = "# CoordinateSystem: " + pyproj.CRS(UTM).to_wkt("WKT1_GDAL")
 
 
 def read(path, text, crs=UTM):
@@ -98,6 +98,53 @@ def test_other_names_count_where_ours_are_not_there_and_the_others_are_ignored(t
         assert points.id == ("P1",)
         np.testing.assert_allclose(place, [[*wanted, 512.3]], rtol=0, atol=1e-8)
         assert notes[:3] == [f"both.csv: column {name!r} is not known and was ignored" for name in ignored]
+
+
+def wkt(*crs):
+    """As Metashape writes a CRS, or a map and heights."""
+    whole = pyproj.CRS(crs[0]) if len(crs) == 1 else pyproj.crs.CompoundCRS(" + ".join(crs), list(crs))
+    return whole.to_wkt("WKT1_GDAL")
+
+
+ZONE_33, EGM96, NAVD88 = "EPSG:32633", "EPSG:5773", "EPSG:5703"
+STATED = {
+    "the same": (f" {wkt(UTM)}", UTM, None),
+    "without a blank": (wkt(UTM), UTM, None),
+    "by another code": (f" {wkt(UTM)}", "EPSG:25832", None),
+    "the same heights": (f" {wkt(UTM, EGM96)}", f"{UTM}+{EGM96}", None),
+    "heights that the flight states": (f" {wkt(UTM)}", f"{UTM}+{EGM96}", None),
+    "another zone": (
+        wkt(ZONE_33),
+        UTM,
+        r"points in 'WGS 84 / UTM zone 33N' lie 446 km away, wanted them in 'EPSG:32632'",
+    ),
+    "a long name": (wkt(UTM), wkt(ZONE_33), r"zone 32N' lie 446 km away, wanted them in 'WGS 84 / UTM zone 33N'$"),
+    "degrees": (wkt(LONLAT), UTM, r"'WGS 84', wanted points in 'EPSG:32632'"),
+    "a map": (wkt(UTM), LONLAT, r"'WGS 84 / UTM zone 32N', wanted points in 'EPSG:4326'"),
+    "heights of a geoid": (wkt(UTM, EGM96), UTM, r"heights are of 'EGM96 height', wanted those above the ellipsoid"),
+    "feet": (wkt(UTM, "EPSG:8228"), f"{UTM}+{NAVD88}", r"lie 356 m away, wanted them in 'EPSG:32632\+EPSG:5703'"),
+}
+
+
+@pytest.mark.parametrize("what", STATED)
+def test_the_crs_that_a_list_states_is_that_of_the_project(tmp_path, what):
+    stated, crs, wanted = STATED[what]
+    path, text = tmp_path / "control.csv", f"# CoordinateSystem:{stated}\n{HEAD}\n{ROW}\n"
+    text = text.replace("# C", "#C") if what == "without a blank" else text
+    if wanted is None:
+        points, place, _, notes = read(path, text, crs)
+        assert points.id == ("P1",) and notes == []
+        np.testing.assert_allclose(place[0, :2], PLACE, rtol=0, atol=1e-8)
+    else:
+        with pytest.raises(UserError, match=r"control\.csv:1: CoordinateSystem: .*" + wanted):
+            read(path, text, crs)
+
+
+def test_a_stated_crs_that_proj_does_not_know_is_noted(tmp_path):
+    text = f"#CoordinateSystem: WGS84; EPSG: 4326\n{HEAD}\n{ROW}\n"
+    assert read(tmp_path / "a.csv", text)[3] == [
+        "a.csv: CoordinateSystem 'WGS84; EPSG: 4326' is none that PROJ knows, and was ignored"
+    ]
 
 
 def test_empty_rows_as_spreadsheets_leave_them_are_none(tmp_path):
