@@ -35,21 +35,25 @@ _COLUMNS = (
 #: shifts of the same system in two programs are some metres apart, models of the same geoid up to one.
 _SAME_PLACE_M, _SAME_HEIGHT_M = 10.0, 1.0
 _STATED_CRS = re.compile(r"#\s*CoordinateSystem:\s*(.*\S)")
-#: Names of columns in lists of other programs and of survey crews, in small letters without blanks, _ and #; the first
-#: that a list has is the one that counts.
-_EASTING = ("x", "e", "east", "easting", "x/east", "x/easting")
-_NORTHING = ("y", "n", "north", "northing", "y/north", "y/northing")
+#: A unit that ends the name of a column.
+_UNIT = re.compile(r"[\[(](?:(?P<m>m|met(?:er|re)s?)|(?P<deg>°|deg(?:rees?)?))[\])]$")
+#: Names of columns in lists of other programs and of survey crews, in small letters without blanks, _, # and unit; the
+#: first that a list has is the one that counts.
+_EASTING = ("x", "e", "east", "easting", "eastings", "x/east", "x/easting")
+_NORTHING = ("y", "n", "north", "northing", "northings", "y/north", "y/northing")
 _LONGITUDE, _LATITUDE = ("x/longitude", "longitude", "lon"), ("y/latitude", "latitude", "lat")
+_ELLIPSOIDAL = ("ellipsoidalheight", "h-ell")
+_ABOVE_SEA = ("altitude", "elevation")
 _OTHER_NAMES = {
-    "point": ("point", "label", "name", "id", "pointid", "pointname"),
+    "point": ("point", "label", "name", "id", "pointid", "pointname", "gcplabel", "p"),
     "X_m": _EASTING + _LONGITUDE,
     "Y_m": _NORTHING + _LATITUDE,
-    "Z_m": ("z", "h", "height", "altitude", "elevation", "z/altitude"),
-    "sigma_X_m": ("accuracyx(m)",),
-    "sigma_Y_m": ("accuracyy(m)",),
-    "sigma_Z_m": ("accuracyz(m)", "verticalaccuracy(m)"),
-    "accuracy": ("accuracyx/y/z(m)",),
-    "level_accuracy": ("accuracyx/y(m)", "horizontalaccuracy(m)"),
+    "Z_m": ("z", "h", "height", *_ABOVE_SEA, "z/altitude"),
+    "sigma_X_m": ("accuracyx", "eastingrms"),
+    "sigma_Y_m": ("accuracyy", "northingrms"),
+    "sigma_Z_m": ("accuracyz", "verticalaccuracy", "accuracyvertical", "accuracyvert", "elevationrms"),
+    "accuracy": ("accuracyx/y/z", "accuracy"),
+    "level_accuracy": ("accuracyx/y", "horizontalaccuracy", "accuracyhorizontal", "accuracyhorz"),
     "enabled": ("enable", "enabled"),
 }
 
@@ -69,9 +73,14 @@ def read_ground_table(path: Path, crs: str, notes: list[str], *, may_be_empty: b
     skip = _remarks(path)
     header = column_names_of(path, skip)
     columns = [
-        _as_headed(column, header, crs) for column in _COLUMNS if column.name != "enabled" or "role" not in header
+        _as_headed(column, header, crs, f"{path}:{skip + 1}")
+        for column in _COLUMNS
+        if column.name != "enabled" or "role" not in header
     ]
     table = read_table(path, columns, notes, may_be_empty=may_be_empty, skip=skip)
+    height = table.headed.get("Z_m", "Z_m")
+    if _plain(height) in _ABOVE_SEA and not _has_heights(crs):
+        notes.append(f"{path.name}: {height} is taken as height above the ellipsoid, for the CRS has no other heights")
     _refuse_other_crs(table, crs, notes)
     values: dict[str, NDArray[Any]] = dict.fromkeys(_SIGMAS, np.full(len(table), np.nan))
     if "accuracy" in table:
@@ -136,15 +145,26 @@ def _refuse_other_crs(table: Table, crs: str, notes: list[str]) -> None:
         raise UserError(f"{where}: points in {told.name!r} lie {apart} away, wanted them in {wanted}")
 
 
-def _as_headed(column: Column, header: Sequence[str], crs: str) -> Column:
+def _as_headed(column: Column, header: Sequence[str], crs: str, where: str) -> Column:
     """The column under the name that a header has for it, where that has none of ours."""
     if set(column.names) & set(header):
         return column
     others = list(_OTHER_NAMES.get(column.name, ()))
+    if column.name == "Z_m" and not _has_heights(crs) and set(_ELLIPSOIDAL) & set(map(_plain, header)):
+        others = list(_ELLIPSOIDAL)
     if _is_geographic(crs):
         others.sort(key=lambda name: name not in _LONGITUDE + _LATITUDE)  # of lists that have both
-    found = sorted((others.index(_plain(name)), name) for name in header if _plain(name) in others)
-    return replace(column, other_names=(*column.other_names, found[0][1])) if found else column
+    units = ("", "m", "deg") if column.name in PLACE else ("", "m")
+    found = sorted({(others.index(_plain(name)), name) for name in header
+                    if _plain(name) in others and _unit(name) in units})  # fmt: skip
+    if not found:
+        return column
+    names = [name for _, name in found]
+    if len(found) > 1 and column.name == "Z_m":  # nobody knows which of them is above the ellipsoid
+        raise UserError(f"{where}: {names[1]}: heights stand in {names[0]}, too; wanted one column of them, or Z_m")
+    if len(found) > 1 and found[0][0] == found[1][0]:
+        raise UserError(f"{where}: {names[1]}: this column comes twice, also as {names[0]}")
+    return replace(column, other_names=(*column.other_names, names[0]))
 
 
 def _is_geographic(crs: str) -> bool:
@@ -154,8 +174,42 @@ def _is_geographic(crs: str) -> bool:
         return False
 
 
+def _has_heights(crs: str) -> bool:
+    """Whether heights count from something else than the ellipsoid."""
+    try:
+        return crs == "local" or (crs != GEOGRAPHIC and known_crs(crs).is_compound)
+    except CrsError:  # as above
+        return True
+
+
 def _plain(name: str) -> str:
+    return _UNIT.sub("", _small(name))
+
+
+def _unit(name: str) -> str:
+    """The unit that a name of a column states: m, deg, or "" for none."""
+    found = _UNIT.search(_small(name))
+    return (found.lastgroup or "") if found else ""
+
+
+def _small(name: str) -> str:
     return re.sub(r"[\s_#]", "", name).lower()
+
+
+def _check_units(table: Table, frame: Frame) -> None:
+    """Refuse coordinates in another unit than the CRS has; beside feet, what is in metres has to say so."""
+    degrees = _LONGITUDE + _LATITUDE
+    stated = {name: _unit(name) or "deg" * (_plain(name) in degrees) for name in table.headed.values()}
+    check_place_units(table, frame, {name: unit for name, unit in stated.items() if unit})
+    if frame.units[0] in ("m", "deg", "grad"):
+        return
+    in_metres = (*_SIGMAS, "accuracy", "level_accuracy", *("Z_m",) * (frame.units[2] == "m"))
+    for column in in_metres:
+        name = table.headed.get(column, column)
+        if name != column and not _unit(name):
+            wanted = f"{column}, or {name} (m)" if column in (*PLACE, *_SIGMAS) else f"{name} (m)"
+            what = f"no unit, beside coordinates in {frame.units[0]}; wanted {wanted}"
+            raise UserError(f"{table.path}:{table.skip + 1}: {name}: {what}")
 
 
 def _accuracies(table: Table) -> NDArray[np.float64]:
@@ -163,7 +217,7 @@ def _accuracies(table: Table) -> NDArray[np.float64]:
     out = np.full((len(table), 3), np.nan)
     for row, text in enumerate(table["accuracy"]):
         try:
-            parts = [float(part) for part in text.split("/") if part]
+            parts = [float(part.replace(",", ".")) for part in text.split("/") if part]
         except ValueError:
             parts = [np.nan]
         if len(parts) > 3 or any(not 0.0 <= part < np.inf for part in parts):
@@ -216,7 +270,7 @@ def known_points(table: Table, frame: Frame, notes: list[str]) -> KnownPoints:
     if not n:
         notes.append(f"{table.path.name}: no points: the block stands on its trajectories alone")
         return KnownPoints((), np.empty((0, 3)), np.empty((0, 3, 3)), ())
-    check_place_units(table, frame, [name for name in table.headed.values() if _plain(name) in _LONGITUDE + _LATITUDE])
+    _check_units(table, frame)
     ids, role = table["point"], table["role"].astype(str)
     repeated = np.ones(n, dtype=bool)
     repeated[np.unique(ids.astype(str), return_index=True)[1]] = False

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,13 +22,13 @@ def place_column(name: str, *, blank: bool = False) -> Column:
     return Column(name, blank=blank, other_names=others)
 
 
-def check_place_units(table: Table, frame: Frame, degrees: Collection[str] = ()) -> None:
+def check_place_units(table: Table, frame: Frame, stated: Mapping[str, str] | None = None) -> None:
     """Refuse columns with a unit that the CRS has not; the plain names ``X_m, Y_m, Z_m`` stand for any.
 
     Parameters
     ----------
-    degrees : names of columns that are in degrees without saying so
     frame : with the CRS of the coordinates
+    stated : units that other names of columns state, by name
 
     Raises
     ------
@@ -36,8 +36,8 @@ def check_place_units(table: Table, frame: Frame, degrees: Collection[str] = ())
     """
     for plain, right, unit in zip(PLACE, place_columns(frame.units), frame.units, strict=True):
         name = table.headed.get(plain, plain)
-        said = f"{plain[0]}_deg" if name in degrees else name
-        if said not in (plain, right) and said in place_column(plain).names:
+        other_unit = name not in (plain, right) and name in place_column(plain).names
+        if other_unit or (stated or {}).get(name, unit) != unit:
             what = f"coordinates in {frame.crs!r} are in {unit}, wanted {right}"
             raise UserError(f"{table.path}:{table.skip + 1}: {name}: {what}")
 

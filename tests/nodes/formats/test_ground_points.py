@@ -29,6 +29,16 @@ LISTS = {
     "a spreadsheet": "\ufeffName;E;N;H;sigma_X_m;sigma_Y_m;sigma_Z_m\r\nP1;691000,5;5334000,2;512,3;0,01;0,02;0,03\r\n",
     "Metashape": f"{PROJCS}\n#Label,Enable,X/Easting,Y/Northing,Z/Altitude,Accuracy_X/Y/Z_(m)\n"
     "P1,1,691000.500000,5334000.200000,512.300000,0.01/0.02/0.03\n",
+    "units in names": "Label,Easting [m],Northing [metres],Height (m),Accuracy_X (m),Accuracy_Y (m),Accuracy_Z (m)\n"
+    "P1,691000.5,5334000.2,512.3,0.01,0.02,0.03\n",
+    # docs of OpenDroneMap and GCPEditorPro; survey points of Emlid Flow, which have heights above the geoid beside them
+    "Emlid": "Name,Code,Easting,Northing,Elevation,Longitude,Latitude,Ellipsoidal height,Easting RMS,Northing RMS,"
+    "Elevation RMS,Lateral RMS,Antenna height\nP1,,691000.5,5334000.2,465.1,0,0,512.3,0.01,0.02,0.03,0.022,1.8\n",
+    "point, northing, easting, height": "P,N,E,Z,D,sigma_X_m,sigma_Y_m,sigma_Z_m\n"
+    "P1,5334000.2,691000.5,512.3,,0.01,0.02,0.03\n",
+    "GCP Label": "GCP Label,Northing,Easting,Elevation,Accuracy\nP1,5334000.2,691000.5,512.3,0.01/0.02/0.03\n",
+    "a comma in an accuracy": "#Label;X/East;Y/North;Z/Altitude;Accuracy_(m)\n"
+    "P1;691000,5;5334000,2;512,3;0,01/0,02/0,03\n",
     "a header as a remark": "# point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m\n"
     "P1,691000.5,5334000.2,512.3,0.01,0.02,0.03\n",
 }
@@ -41,8 +51,9 @@ def test_a_point_is_where_and_as_good_as_each_list_says(tmp_path, what):
     np.testing.assert_allclose(place, [[*PLACE, 512.3]], rtol=0, atol=1e-8)
     # 2 deg of convergence mix X and Y a little
     np.testing.assert_allclose(sigma, [[0.01, 0.02, 0.03]], rtol=2e-2)
-    said = [] if what in ("ours", "Metashape") else ["control.csv: no column role: all points are control"]
-    assert notes == said
+    assert ("control.csv: no column role: all points are control" in notes) == (what not in ("ours", "Metashape"))
+    above = "control.csv: Elevation is taken as height above the ellipsoid, for the CRS has no other heights"
+    assert (above in notes) == (what in ("northing first", "GCP Label"))
 
 
 def test_one_accuracy_and_those_in_level_and_in_height(tmp_path):
@@ -53,10 +64,54 @@ def test_one_accuracy_and_those_in_level_and_in_height(tmp_path):
     np.testing.assert_allclose(place, [[48.1, 11.5, 500], [48.2, 11.6, 510], [48.3, 11.7, 520]], rtol=0, atol=1e-6)
     np.testing.assert_allclose(sigma, [[0.05, 0.05, 0.05], [0.02, 0.02, 0.05], [0.01, 0.02, 0.03]], rtol=1e-3)
     assert notes == ["ms.csv: column 'X_error' is not known and was ignored"]
-    text = (
-        "Label,Longitude,Latitude,Altitude,Horizontal accuracy (m),Vertical accuracy (m)\nA,11.5,48.1,500,0.02,0.04\n"
-    )
-    np.testing.assert_allclose(read(tmp_path / "p4d.csv", text, LONLAT)[2], [[0.02, 0.02, 0.04]], rtol=1e-3)
+    for names in (
+        "Longitude,Latitude,Altitude,Horizontal accuracy (m),Vertical accuracy (m)",
+        "Longitude [deg],Latitude [deg],Altitude [meter],Accuracy Horz [meter],Accuracy Vert [meter]",
+    ):
+        points, place, sigma, _ = read(tmp_path / "p4d.csv", f"Label,{names}\nA,11.5,48.1,500,0.02,0.04\n", LONLAT)
+        np.testing.assert_allclose(place, [[48.1, 11.5, 500]], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(sigma, [[0.02, 0.02, 0.04]], rtol=1e-3)
+
+
+EMLID = "Name,Easting,Northing,Elevation,Ellipsoidal height,Easting RMS,Northing RMS,Elevation RMS\n"
+FEET = "EPSG:2263"
+
+
+def test_of_two_heights_those_count_that_the_crs_is_of(tmp_path):
+    text = EMLID + "P1,691000.5,5334000.2,465.1,512.3,0.01,0.02,0.03\n"
+    _, place, _, notes = read(tmp_path / "control.csv", text, UTM)
+    assert place[0, 2] == pytest.approx(512.3)
+    assert "control.csv: column 'Elevation' is not known and was ignored" in notes
+    # without the grid of the geoid here, PROJ takes heights as they are
+    points, frame = read_ground_points(tmp_path / "control.csv", f"{UTM}+EPSG:5773", None, [])
+    assert frame.to_crs(points.xyz_l)[0, 2] == pytest.approx(465.1)
+    for crs, names in ((UTM, "H,h"), (UTM, "Height,Elevation"), ("local", "H,h")):
+        with pytest.raises(UserError, match=r":1: (h|Elevation): heights stand in (H|Height), too; wanted one column"):
+            read(tmp_path / "two.csv", f"Name,E,N,{names},Accuracy\nP1,691000.5,5334000.2,465.1,512.3,1\n", crs)
+    with pytest.raises(UserError, match=r":1: Z_m: column missing"):
+        read(tmp_path / "one.csv", EMLID.replace("Elevation,", ""), f"{UTM}+EPSG:5773")
+    with pytest.raises(UserError, match=r":1: e: this column comes twice, also as E"):
+        read(tmp_path / "two.csv", "Name,E,e,N,H,Accuracy\nP1,691000.5,691000.5,5334000.2,465.1,1\n")
+
+
+def test_beside_feet_metres_have_to_be_stated(tmp_path):
+    """New York in US survey feet: heights of a CRS without heights, and sigmas, are in metres."""
+    row = "P1,984000,195000,10,0.02,0.02,0.03\n"
+    head = "Name,Easting,Northing,Z_m,Accuracy_X (m),Accuracy_Y (m),sigma_Z_m\n"
+    _, place, sigma, _ = read(tmp_path / "control.csv", head + row, FEET)
+    lat, lon = pyproj.Transformer.from_crs(FEET, LONLAT).transform(984000, 195000)
+    np.testing.assert_allclose(place, [[lat, lon, 10.0]], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(sigma, [[0.02, 0.02, 0.03]], rtol=1e-3)
+    for ours, theirs, wanted in (
+        ("Z_m", "Elevation", r"Elevation: no unit, beside coordinates in ft_us; wanted Z_m, or Elevation \(m\)"),
+        ("sigma_Z_m", "Elevation RMS", r"Elevation RMS: no unit, .*; wanted sigma_Z_m, or"),
+        ("Accuracy_X (m)", "Accuracy_X", r"Accuracy_X: no unit, .*; wanted sigma_X_m, or"),
+        ("Easting", "Easting [m]", r"Easting \[m\]: coordinates in 'EPSG:2263' are in ft_us, wanted X_ft_us"),
+    ):
+        with pytest.raises(UserError, match=r"control\.csv:1: " + wanted):
+            read(tmp_path / "control.csv", head.replace(ours, theirs) + row, FEET)
+    with pytest.raises(UserError, match=r":1: Easting \[deg\]: coordinates in 'EPSG:32632' are in m, wanted X_m"):
+        read(tmp_path / "control.csv", head.replace("Easting", "Easting [deg]") + row)
 
 
 HEAD = "#Label,Enable,X/Easting,Y/Northing,Z/Altitude,Accuracy_X/Y/Z_(m)"
