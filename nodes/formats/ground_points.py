@@ -127,7 +127,10 @@ def _refuse_other_crs(table: Table, crs: str, notes: list[str]) -> None:
         notes.append(f"{table.path.name}: CoordinateSystem {stated[:40]!r} is none that PROJ knows, and was ignored")
         return
     project = "EPSG:4979" if crs == GEOGRAPHIC else crs
-    mine = known_crs(project)
+    try:
+        mine = known_crs(project)
+    except CrsError:  # told where the points are brought into it
+        return
     wanted = repr(crs if len(crs) < LONGEST_NAME else mine.name)
     if told.is_compound and not mine.is_compound:
         what = f"heights are of {told.sub_crs_list[1].name!r}, wanted those above the ellipsoid, as {wanted} has them"
