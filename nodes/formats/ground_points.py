@@ -31,8 +31,8 @@ _COLUMNS = (
     Column("level_accuracy", optional=True, blank=True, low=0.0),
     Column("enabled", "text", optional=True, choices=("1", "0", "True", "False", "true", "false")),
 )
-#: Places by the CRS that a list states and by the project's lie so close, m, in level and in height. Tuned: datum
-#: shifts of the same system in two programs are some metres apart, models of the same geoid up to one.
+#: Places by the CRS that a list states and by the project's lie so close, m, in level and in height: datum shifts of
+#: the same system in two programs are some metres apart, models of the same geoid up to one; zones and feet far more.
 _SAME_PLACE_M, _SAME_HEIGHT_M = 10.0, 1.0
 _STATED_CRS = re.compile(r"#\s*CoordinateSystem:\s*(.*\S)")
 #: A unit that ends the name of a column.
@@ -72,11 +72,10 @@ def read_ground_table(path: Path, crs: str, notes: list[str], *, may_be_empty: b
     """
     skip = _remarks(path)
     header = column_names_of(path, skip)
-    columns = [
-        _as_headed(column, header, crs, f"{path}:{skip + 1}")
-        for column in _COLUMNS
-        if column.name != "enabled" or "role" not in header
-    ]
+    ours = {"enabled"} if "role" in header else set[str]()  # what stands for columns that are there says nothing
+    ours |= {"accuracy", "level_accuracy"} if set(_SIGMAS) <= set(header) else set()
+    wanted = [column for column in _COLUMNS if column.name not in ours]
+    columns = [_as_headed(column, header, crs, f"{path}:{skip + 1}") for column in wanted]
     table = read_table(path, columns, notes, may_be_empty=may_be_empty, skip=skip)
     height = table.headed.get("Z_m", "Z_m")
     if _plain(height) in _ABOVE_SEA and not _has_heights(crs):
@@ -172,7 +171,7 @@ def _as_headed(column: Column, header: Sequence[str], crs: str, where: str) -> C
 
 def _is_geographic(crs: str) -> bool:
     try:
-        return crs == GEOGRAPHIC or LocalFrame(0.0, 0.0, 0.0, crs).units[0] == "deg"
+        return crs == GEOGRAPHIC or (crs != "local" and known_crs(crs).is_geographic)
     except CrsError:  # told where the points are brought into it
         return False
 

@@ -140,13 +140,14 @@ BAD = {
 
 def test_other_names_count_where_ours_are_not_there_and_the_others_are_ignored(tmp_path):
     """A description beside our columns is no name of a point, and a list may have places in degrees and on a map."""
-    ours = "point,name,X_m,Y_m,Z_m,h,sigma_X_m,sigma_Y_m,sigma_Z_m,Accuracy_X/Y/Z_(m),role,enabled\n"
-    row = "P1,a hill,691000.5,5334000.2,512.3,7,0.01,0.01,0.03,9,control,no\n"
+    ours = "point,name,X_m,Y_m,Z_m,h,sigma_X_m,sigma_Y_m,sigma_Z_m,accuracy,role,enabled\n"
+    row = "P1,a hill,691000.5,5334000.2,512.3,7,0.01,0.01,0.03,good,control,no\n"
     points, place, sigma, notes = read(tmp_path / "control.csv", ours + row)
     assert (points.id, points.role) == (("P1",), ("control",))
     np.testing.assert_allclose(place, [[*PLACE, 512.3]], rtol=0, atol=1e-8)
     np.testing.assert_allclose(sigma, [[0.01, 0.01, 0.03]], rtol=1e-3)
-    assert notes == [f"control.csv: column {name!r} is not known and was ignored" for name in ("name", "h", "enabled")]
+    ignored = ("name", "h", "accuracy", "enabled")
+    assert notes == [f"control.csv: column {name!r} is not known and was ignored" for name in ignored]
     both = "ID,Name,Lat,Lon,E,N,H,sigma_X_m,sigma_Y_m,sigma_Z_m\n7,P1,48.1,11.5,691000.5,5334000.2,512.3,1,1,1\n"
     for crs, wanted, ignored in ((UTM, PLACE, ("ID", "Lat", "Lon")), (LONLAT, (48.1, 11.5), ("ID", "E", "N"))):
         points, place, _, notes = read(tmp_path / "both.csv", both, crs)
