@@ -207,9 +207,9 @@ def read_table(
         if problems:
             raise UserError(one_line(problems))
     blank = _blank_rows(frame)
-    if blank.any():  # as spreadsheets leave them below the last row
-        if problems := _problems(path, known, skip):  # other columns have something there
-            raise UserError(one_line(problems))
+    if blank.any():
+        whole = pd.read_csv(path, dtype=str, keep_default_na=False, **text)
+        blank &= _blank_rows(whole)  # a column that is not known may have something there
         frame = frame[~blank]
     values: dict[str, NDArray[Any]] = {}
     for name, column in known.items():
@@ -230,7 +230,7 @@ def read_table(
 
 
 def _blank_rows(frame: Any) -> NDArray[np.bool_]:
-    """Rows of pandas (n,) in which all columns that are read are empty."""
+    """Rows of pandas (n,) in which all columns are empty, as spreadsheets leave them below the last one."""
     blank = np.ones(len(frame), dtype=bool)
     for name in sorted(frame, key=lambda name: frame[name].dtype != float):  # numbers are looked through faster
         if blank.any():
