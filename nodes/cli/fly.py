@@ -264,7 +264,8 @@ class Fly(LiveFlight):
         origin, place = self.flight.origin_deg, self.first.place
         if origin is None or place is None or ("origin", "far") in self._told:
             return
-        from ..formats.flight_folder import FAR_M, distance_m
+        from ..formats.flight_folder import distance_m
+        from ..formats.ground_points import FAR_M
 
         self._told.add(("origin", "far"))
         away = distance_m(np.array([origin]), np.array([place]))

@@ -20,7 +20,7 @@ from ...solver.models import WANDER_SIGMAS, WANDER_TIMES, setting_names
 from ..convert import LONGEST_STRIP_S
 from ..errors import UserError
 from .camera_json import read_camera
-from .ground_points import known_points, read_ground_table
+from .ground_points import FAR_M, known_points, read_ground_table
 from .keys import Keys, is_there, read_toml
 from .place_columns import PLACE, check_place_units, place_column, to_local
 from .projection import notes_of_heights
@@ -28,6 +28,9 @@ from .table import Column, Table, column_names_of, one_line, read_table
 
 #: Files that make a folder a block folder (project.toml may be absent).
 FILES = ("camera.json", "strips.csv", "trajectory.csv", "ground_points.csv", "image_points.csv")
+
+#: Known points are looked for at about so many poses of the trajectories.
+_PLACES = 1000
 
 _STRIPS = (
     Column("strip", "text"),
@@ -94,6 +97,7 @@ def read_block(folder: Path | str, with_lines: bool = False) -> BlockData:
     strip_table = _strip_table(folder / "strips.csv", notes)
     poses = read_table(folder / "trajectory.csv", _TRAJECTORY, notes)
     ground_table = read_ground_table(folder / "ground_points.csv", crs, notes, may_be_empty=True)
+    _refuse_far(ground_table, poses, crs)
     frame = _frame(folder, crs, poses, ground_table)
     notes.extend(f"project.toml: {note}" for note in notes_of_heights(crs))
 
@@ -168,6 +172,36 @@ def _settings(table: Keys) -> dict[str, object]:
         else:
             settings[key] = table.raw(key)
     return settings
+
+
+def _refuse_far(ground: Table, poses: Table, crs: str) -> None:
+    """Raise UserError where no known point is near the trajectories, and say whether one is with X and Y exchanged."""
+    ground = ground.part(np.isfinite(ground["X_m"]) & np.isfinite(ground["Y_m"]))
+    if not len(ground):
+        return
+    xyz, places = np.nan_to_num(ground.stack(*PLACE)), poses.stack(*PLACE)[:: 1 + len(poses) // _PLACES]
+    # looks may go as far aside as the flight is high
+    near = FAR_M + max(0.0, float(np.median(places[:, 2]) - np.median(xyz[:, 2])))
+    try:
+        frame = LocalFrame.around(places, crs)
+        seen = frame.from_crs(places)
+    except CrsError:  # told where the frame of all is made
+        return
+    far = _level_distance(to_local(ground, xyz, frame), seen)
+    if far <= near:
+        return
+    try:
+        exchanged = _level_distance(frame.from_crs(xyz[:, [1, 0, 2]]), seen) <= near
+    except CrsError:
+        exchanged = False
+    what = f"no point lies within {1e-3 * far:.0f} km of the trajectories, wanted coordinates in {crs!r}"
+    raise UserError(f"{ground.path}: {what}{'; X and Y are exchanged' * exchanged}")
+
+
+def _level_distance(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
+    """Least distance in level between points (n, 3) and (m, 3)."""
+    step = one[:, None, :2] - other[None, :, :2]
+    return float(np.hypot(step[..., 0], step[..., 1]).min())
 
 
 def _frame(folder: Path, crs: str, poses: Table, ground: Table) -> LocalFrame:

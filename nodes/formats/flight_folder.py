@@ -29,7 +29,7 @@ from .detect import KINDS, Options, kind_of_path, read_any, read_track, sensor_s
 from .envi_image import TYPES
 from .geocal_xml import read_glas_camera
 from .ground_height import HIGHEST_M, LOWEST_M, NOT_GIVEN, GroundGiven
-from .ground_points import read_ground_points
+from .ground_points import FAR_M, read_ground_points
 from .image_cubes import cubes_of, is_pattern
 from .image_lines import ImageStrip, LinesGiven, open_strips
 from .keys import Keys, is_there, read_toml
@@ -41,8 +41,6 @@ from .time_columns import instant_ns
 from .track import Mounting, NavigationTrack
 
 FILE = "flight.toml"
-#: Control whose nearest point is farther from the flight, m, is in another CRS or of another flight.
-FAR_M = 50e3
 #: Control that lies farther outside of the area of its CRS, degrees, is likely to be in another one: maps are used in
 #: neighbouring zones, too.
 OUTSIDE_DEG = 5.0

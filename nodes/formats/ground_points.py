@@ -31,6 +31,8 @@ _COLUMNS = (
     Column("level_accuracy", optional=True, blank=True, low=0.0),
     Column("enabled", "text", optional=True, choices=("1", "0", "True", "False", "true", "false")),
 )
+#: Control whose nearest point is farther from the flight, m, is in another CRS or of another flight.
+FAR_M = 50e3
 #: Places by the CRS that a list states and by the project's lie so close, m, in level and in height: datum shifts of
 #: the same system in two programs are some metres apart, models of the same geoid up to one; zones and feet far more.
 _SAME_PLACE_M, _SAME_HEIGHT_M = 10.0, 1.0

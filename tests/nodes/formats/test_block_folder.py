@@ -68,6 +68,30 @@ def test_byte_order_mark_crlf_and_blank_lines(tmp_path):
     assert len(read_block(folder).image) == 3
 
 
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4326"])
+def test_known_points_of_another_place_are_refused(tmp_path, crs):
+    """As of a wrong zone, and with X and Y exchanged: `check` said that the block is complete."""
+    x, y, one_m = (691000.0, 5334000.0, 1.0) if crs == "EPSG:32632" else (11.5, 48.1, 1e-5)
+    head, *rows = (line.split(",") for line in FILES["trajectory.csv"].splitlines())
+    moved = ([s, t, str(x + one_m * float(a)), str(y + one_m * float(b)), *more] for s, t, a, b, *more in rows)
+    files = {
+        "project": FILES["project.toml"].replace("local", crs),
+        "trajectory": "\n".join(",".join(row) for row in (head, *moved)),
+        "image_points": "point,strip,ccd,line,sample\nG1,S1,F,500,500\n",
+    }
+
+    def points_at(x, y):
+        ground = f"{GROUND.splitlines()[0]}\nG1,{x},{y},100,1,1,1,control\n"
+        return len(read_block(write_files(tmp_path, ground_points=ground, **files)).ground)
+
+    far = r"ground_points\.csv: no point lies within \d+ km of the trajectories, wanted coordinates in 'EPSG:\d+'"
+    assert points_at(x + 40_000.0 * one_m, y) == 1
+    with pytest.raises(UserError, match=far + "$"):
+        points_at(x - 440_000.0 * one_m, y)
+    with pytest.raises(UserError, match=far + "; X and Y are exchanged$"):
+        points_at(y, x)
+
+
 TRAJECTORY = FILES["trajectory.csv"]
 GROUND = FILES["ground_points.csv"]
 IMAGE = FILES["image_points.csv"]
