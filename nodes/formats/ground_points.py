@@ -36,6 +36,7 @@ FAR_M = 50e3
 #: Places by the CRS that a list states and by the project's lie so close, m, in level and in height: datum shifts of
 #: the same system in two programs are some metres apart, models of the same geoid up to one; zones and feet far more.
 _SAME_PLACE_M, _SAME_HEIGHT_M = 10.0, 1.0
+_FIRST_OF_GCP_LIST = re.compile(r"EPSG:\d+$|\+proj=|WGS84 UTM \d+", re.IGNORECASE)
 _STATED_CRS = re.compile(r"#\s*CoordinateSystem:\s*(.*\S)")
 #: A unit that ends the name of a column.
 _UNIT = re.compile(r"[\[(](?:(?P<m>m|met(?:er|re)s?)|(?P<deg>°|deg(?:rees?)?))[\])]$")
@@ -74,6 +75,11 @@ def read_ground_table(path: Path, crs: str, notes: list[str], *, may_be_empty: b
     """
     skip = _remarks(path)
     header = column_names_of(path, skip)
+    if len(header) == 1 and _FIRST_OF_GCP_LIST.match(header[0]):
+        raise UserError(
+            f"{path}:{skip + 1}: a list of OpenDroneMap (gcp_list.txt), with pixels of frame images and no sigmas, "
+            "wanted a header with point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m"
+        )
     ours = {"enabled"} if "role" in header else set[str]()  # what stands for columns that are there says nothing
     ours |= {"accuracy", "level_accuracy"} if set(_SIGMAS) <= set(header) else set()
     wanted = [column for column in _COLUMNS if column.name not in ours]

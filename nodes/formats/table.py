@@ -349,10 +349,19 @@ def _header(path: Path, columns: Sequence[Column], notes: list[str], skip: int) 
 
 def separator_hint(header: Sequence[str], missing: str) -> str:
     """What may be wrong with a header in which a column is missing; "" where that is nothing else."""
+    if sum(_is_number(name) for name in header) > 1:
+        return "; values stand there, wanted a row of names above them"
     if len(header) < 2:
         return "; is the separator a comma?" if any(c in name for name in header for c in "\t ") else ""
     same = next((name for name in header if name != missing and name.lower() == missing.lower()), None)
     return f"; capital letters count: {same} stands there" if same else ""
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return bool(np.isfinite(float(text)))
+    except ValueError:
+        return False
 
 
 def _names(columns: Sequence[Column]) -> str:

@@ -119,7 +119,28 @@ ROW = "P1,1,691000.5,5334000.2,512.3,0.02"
 BAD = {
     "no sigma": ("Name,E,N,H\nP1,691000.5,5334000.2,512.3\n", r"control\.csv:2: sigma_X_m: missing, wanted a number"),
     "no height": ("Name,E,N\nP1,691000.5,5334000.2\n", r"control\.csv:1: Z_m: column missing"),
-    "no header": ("P1,691000.5,5334000.2,512.3\n", r"control\.csv:1: point: column missing, wanted point,X_m,Y_m,Z_m"),
+    "no header": (
+        "P1,691000.5,5334000.2,512.3\n",
+        r"control\.csv:1: point: .*; values stand there, wanted a row of names above them$",
+    ),
+    "point, northing, easting without a header": (
+        "1,5334000.2,691000.5,512.3,GCP\n",
+        r":1: point: .*; values stand there",
+    ),
+    "of OpenDroneMap": (
+        "WGS84 UTM 32N\n691000.5 5334000.2 512.3 100.5 200.5 DJI_1.JPG P1\n",
+        r":1: .*gcp_list\.txt.*wanted a header",
+    ),
+    "of OpenDroneMap by code": (
+        "EPSG:32632\n691000.5\t5334000.2\t512.3\t100.5\t200.5\tDJI_1.JPG\n",
+        r":1: .*gcp_list\.txt",
+    ),
+    "of OpenDroneMap by PROJ": ("+proj=utm +zone=32 +datum=WGS84\n1 2 3 4 5 A.JPG\n", r":1: .*gcp_list\.txt"),
+    "of QGIS": ("#CRS: WGS 84\nmapX,mapY,sourceX,sourceY,enable\n1,2,3,4,1\n", r":1: point: column missing"),
+    "degrees, minutes": (
+        "Name,E,N,H,Accuracy\nP1,11 30 00.0,48 06 00.0,500,1\n",
+        r":2: E: '11 30 00\.0' is not a number",
+    ),
     "degrees": (
         "Name,Longitude,Latitude,Height,sigma_X_m,sigma_Y_m,sigma_Z_m\nP1,11.5,48.1,500,1,1,1\n",
         r"control\.csv:1: Longitude: coordinates in 'EPSG:32632' are in m, wanted X_m",
