@@ -20,7 +20,7 @@ from ...solver.models import WANDER_SIGMAS, WANDER_TIMES, setting_names
 from ..convert import LONGEST_STRIP_S
 from ..errors import UserError
 from .camera_json import read_camera
-from .ground_points import FAR_M, known_points, read_ground_table
+from .ground_points import FAR_M, known_points, notes_of_names, read_ground_table
 from .keys import Keys, is_there, read_toml
 from .place_columns import PLACE, check_place_units, place_column, to_local
 from .projection import notes_of_heights
@@ -351,6 +351,7 @@ def _image_points(
         notes.append(f"image_points.csv:{table.line_of(int(row))}: {what}; the ray cannot be used")
     if len(unknown) > 5:
         notes.append(f"image_points.csv: {len(unknown) - 5} more rays name an unknown strip or CCD line")
+    notes.extend(notes_of_names(tuple(ids), len(ground), point))
     line, sample = table["line"], table["sample"]
     sigma = np.full(len(table), apriori.image_sigma_px)
     if "sigma_px" in table:

@@ -16,6 +16,7 @@ from ...solver.adjustment.block_data import KnownPoints
 from ...solver.adjustment.network import ROLES
 from ...solver.geometry.frames import GEOGRAPHIC, CrsError, Frame, LocalFrame, known_crs
 from ..errors import UserError
+from ..first_of import first_of
 from .place_columns import PLACE, check_place_units, place_column, to_local
 from .projection import LONGEST_NAME
 from .table import Column, Table, column_names_of, read_table
@@ -33,6 +34,8 @@ _COLUMNS = (
 )
 #: Control whose nearest point is farther from the flight, m, is in another CRS or of another flight.
 FAR_M = 50e3
+#: Pairs of names that are told.
+_MOST_NAMED = 3
 #: Places by the CRS that a list states and by the project's lie so close, m, in level and in height: datum shifts of
 #: the same system in two programs are some metres apart, models of the same geoid up to one; zones and feet far more.
 _SAME_PLACE_M, _SAME_HEIGHT_M = 10.0, 1.0
@@ -307,6 +310,31 @@ def known_points(table: Table, frame: Frame, notes: list[str]) -> KnownPoints:
     covariance = R @ (np.square(np.nan_to_num(sigma))[:, :, None] * np.swapaxes(R, -1, -2))
     radius = np.nan_to_num(table["target_radius_m"]) if "target_radius_m" in table else np.zeros(n)
     return KnownPoints(tuple(ids), xyz_l, covariance, tuple(role.tolist()), tuple(radius.tolist()))
+
+
+def notes_of_names(ids: Sequence[str], n_known: int, measured: NDArray[np.int64]) -> list[str]:
+    """What is said of known points that no image has, where one has their name but for capitals and zeros.
+
+    Parameters
+    ----------
+    ids : names of all points, the known ones first
+    n_known : how many these are
+    measured : numbers of the points that images have
+    """
+    missing = np.setdiff1d(np.arange(n_known), measured)
+    if not len(missing):
+        return []
+    others = {_spelt(id): id for id in ids[n_known:]}
+    pairs = [f"{ids[k]} and {others[_spelt(ids[k])]}" for k in missing if _spelt(ids[k]) in others]
+    if not pairs:
+        return []
+    names = "names differ by capitals or zeros alone, and count as different points"
+    return [f"ground_points.csv and image_points.csv: {names}: {first_of(pairs, _MOST_NAMED)}"]
+
+
+def _spelt(id: str) -> str:
+    """A name as spreadsheets leave it: 007 becomes 7, or 7.0."""
+    return re.sub(r"(?<!\d)0+(?=\d)", "", id.lower()).removesuffix(".0")
 
 
 def _shown(value: float) -> str:

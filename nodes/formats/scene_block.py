@@ -34,7 +34,7 @@ from ...solver.scene_adjustment.images import ImageModel
 from ...solver.scene_adjustment.rigorous import LensView, lens_view
 from ..errors import UserError
 from .block_folder import trajectory_settings, unknown_settings
-from .ground_points import known_points, read_ground_table
+from .ground_points import known_points, notes_of_names, read_ground_table
 from .keys import Keys, read_toml
 from .new_file import new_file
 from .projection import notes_of_heights
@@ -453,6 +453,7 @@ def _image_points(
         raise UserError(f"{table.path}: no row that can be used; the first: {unusable[0]}")
     ids: dict[str, int] = {id: k for k, id in enumerate(ground.id)}
     point = np.array([ids.setdefault(str(id), len(ids)) for id in table["point"][rows]], dtype=np.int64)
+    notes.extend(notes_of_names(tuple(ids), len(ground), point))
     sigma = np.full(len(rows), sigma_px)
     if "sigma_px" in table:
         stated = table["sigma_px"][rows]

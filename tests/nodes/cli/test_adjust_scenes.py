@@ -272,6 +272,13 @@ def test_scenes_have_the_sigmas_of_their_own_metadata(made, tmp_path, capsys):
     np.testing.assert_allclose(data.trajectory_settings()["offset_sigma_m"], [30.0, 40.0, 50.0])
 
 
+def test_known_points_whose_names_have_other_capitals_in_the_images_are_told(block):
+    image = pd.read_csv(block / "image_points.csv")
+    assert "names differ" not in "\n".join(read_scene_block(block).notes)
+    image.assign(point=image["point"].str.lower()).to_csv(block / "image_points.csv", index=False)
+    assert "names differ by capitals or zeros alone" in "\n".join(read_scene_block(block).notes)
+
+
 def test_control_that_lost_its_image_points_is_named(block, capsys):
     """A latitude mistyped by a degree: of two rays nothing tells who is wrong, and the point stands as it was given.
 

@@ -68,6 +68,15 @@ def test_byte_order_mark_crlf_and_blank_lines(tmp_path):
     assert len(read_block(folder).image) == 3
 
 
+@pytest.mark.parametrize("measured, told", [("g1", True), ("G01", True), ("G1.0", True), ("G10", False), ("G1", False)])
+def test_names_that_differ_by_capitals_or_zeros_are_told(tmp_path, measured, told):
+    """As where a spreadsheet has made numbers of the names in one of the files: control lost its image points."""
+    image = FILES["image_points.csv"].replace("G1", measured)
+    notes = "\n".join(read_block(write_files(tmp_path, image_points=image)).notes)
+    said = f"names differ by capitals or zeros alone, and count as different points: G1 and {measured}"
+    assert ((said in notes), ("names differ" in notes)) == (told, told)
+
+
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:4326"])
 def test_known_points_of_another_place_are_refused(tmp_path, crs):
     """As of a wrong zone, and with X and Y exchanged: `check` said that the block is complete."""
