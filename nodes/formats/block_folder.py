@@ -200,8 +200,9 @@ def _refuse_far(ground: Table, poses: Table, crs: str) -> None:
 
 def _level_distance(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
     """Least distance in level between points (n, 3) and (m, 3)."""
-    step = one[:, None, :2] - other[None, :, :2]
-    return float(np.hypot(step[..., 0], step[..., 1]).min())
+    from scipy.spatial import KDTree
+
+    return float(np.min(KDTree(other[:, :2]).query(one[:, :2])[0]))
 
 
 def _frame(folder: Path, crs: str, poses: Table, ground: Table) -> LocalFrame:
