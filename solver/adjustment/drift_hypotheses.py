@@ -185,13 +185,15 @@ class _Alarm:
     leader: Group | None = None
     named: frozenset[Group] = frozenset()
 
-    def update(self, now_s: float, tests: dict[Group, float], limit: float, decisive: float, matters: bool) -> bool:
+    def update(
+        self, now_s: float, tests: dict[Group, float], limit: float, instead: float, decisive: float, matters: bool
+    ) -> bool:
         """Take in new tests; whether there is an alarm."""
         best = max(tests, key=tests.__getitem__)
         if self.leader not in tests:
             self.leader, self.named = None, frozenset()
         if self.leader is None:
-            self.failed = self.failed + 1 if tests[best] > limit and matters else 0
+            self.failed = self.failed + 1 if tests[best] > limit + instead and matters else 0
             if self.failed < CONFIRMED:
                 return False
             self.leader, self.since_s = best, now_s
@@ -230,13 +232,20 @@ class Suspicion:
         return float(chi2.isf(self.alpha, EACH)) * factor
 
     def judge(
-        self, now_s: float, scores: Scores, of: Sequence[Hypothesis], factor: float = 1.0
+        self,
+        now_s: float,
+        scores: Scores,
+        of: Sequence[Hypothesis],
+        factor: float = 1.0,
+        instead: float = 0.0,
     ) -> tuple[BiasedSource, ...]:
         """Test all hypotheses.
 
         Parameters
         ----------
         factor : by which the cofactors of scores are larger than stated
+        instead : twice the logarithm of the likelihood ratio of what may be wrong instead: a drift is named anew where
+            it is the better explanation by as much as a drift has to be better than none
         """
         limit = self.limit(factor)
         given, open_, result, least = [scores], list(of), [], limit
@@ -250,7 +259,7 @@ class Suspicion:
             if i == 0:
                 self.strongest = tests[best.name]
             matters = float(np.abs(given[0].bias(best)[:2]).max()) >= MATTERS_PX
-            if not alarm.update(now_s, tests, max(limit, least), DECISIVE * factor, matters):
+            if not alarm.update(now_s, tests, max(limit, least), instead, DECISIVE * factor, matters):
                 for later in self._alarms[i + 1 :]:
                     later.forget()
                 break

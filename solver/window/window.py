@@ -515,7 +515,10 @@ class Window:
         quality.integrity.note([b for b in changed if b in batches])  # what left at once is no more exposed
         findings, solution = quality.last, state.solution
         look = WATCH in duties or findings is None or findings.strip != (newest.id if newest else "")
-        changed_sources = quality.watch_sources(self._now_s, look, SOURCES in duties)
+        test = SOURCES in duties
+        suspicious = test and self._sources.is_suspicious
+        wander = self._sigma_check.gain_of_wanders(newest) if suspicious and newest else 0.0
+        changed_sources = quality.watch_sources(self._now_s, look, test, wander)
         if look or changed_sources or findings is None:
             noise = self._noise(newest) if newest else np.zeros((6, 6))
             findings = quality.look(self._now_s, self._length_s, fit, noise)

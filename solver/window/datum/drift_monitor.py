@@ -231,18 +231,24 @@ class DriftMonitor:
         """Time since the strip began, in units of the drift's."""
         return (now_s - self._start_s) / DRIFT_S
 
-    def test(self, now_s: float, of_all: bool = True) -> None:
+    @property
+    def is_suspicious(self) -> bool:
+        """Whether the last test has failed and nothing is named yet."""
+        return not self.biased and bool(self._suspicion.strongest > self._limit)
+
+    def test(self, now_s: float, of_all: bool = True, instead: float = 0.0) -> None:
         """Test with what is in the border, of all batches of the strip; the state is solved.
 
         Parameters
         ----------
         of_all : whether a drift that all CCD lines share may be named; not where something else explains it
+        instead : what speaks for another explanation, see `Suspicion.judge`
         """
         self._tested_s, batches = now_s, self._mine(self._network.batches)
         cells = self._in_border(batches)
         border, found, factor = self._assembled(now_s, cells)
         scores = self._scores(now_s, batches, cells, border)
-        suspected = self._suspicion.judge(now_s, scores, found, factor) if found else ()
+        suspected = self._suspicion.judge(now_s, scores, found, factor, instead) if found else ()
         self.biased = tuple(source for source in suspected if of_all or source.ccd != ALL)
         self._limit = self._suspicion.limit(factor)
         self._drift = None

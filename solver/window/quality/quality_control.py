@@ -68,9 +68,14 @@ class QualityControl:
             functions = np.concatenate([A[0], ground.functions @ A[0]])
         return self.integrity.at(numbers, functions, self._network.state, renew)
 
-    def watch_sources(self, now_s: float, look: bool, test: bool) -> bool:
+    def watch_sources(self, now_s: float, look: bool, test: bool, wander: float = 0.0) -> bool:
         """Tie points that drift: take in what has settled where there is a look, test where it is time; whether others
-        drift than before."""
+        drift than before.
+
+        Parameters
+        ----------
+        wander : what speaks for a wander of the trajectory that is larger than stated, see `SigmaCheck.gain_of_wanders`
+        """
         before = self._sources.biased
         if look:
             if self._sources.begin():
@@ -79,7 +84,7 @@ class QualityControl:
         # while new looks disagree by far more than sigmas say, these are asked first: no source is named as well
         if test and (before or self._network.sigmas.disagreement == 1.0):
             # where control and GNSS are told to differ, that is why all tie points contradict one of them
-            self._sources.test(now_s, of_all=not self._control.differs_from_gnss)
+            self._sources.test(now_s, of_all=not self._control.differs_from_gnss, instead=wander)
         return self._sources.biased != before
 
     def look(self, now_s: float, length_s: float, fit: Fit, noise: Array) -> QualityFindings:

@@ -186,6 +186,11 @@ class SigmaCheck:
         """Whether larger offsets, shifts and drifts make the data more likely than a worse camera does."""
         return self._gain(strip, CONSTANT) > self._network.calibration.gain()
 
+    def gain_of_wanders(self, strip: WindowStrip) -> float:
+        """By how much minus twice the logarithm of the likelihood of the data falls where the wanders are stated as
+        much larger as is likely best: what the sigmas do not say yet looks like many another error."""
+        return self._gain(strip, WANDERS)
+
     def _gain(self, strip: WindowStrip, pair: tuple[int, int]) -> float:
         """By how much minus twice the logarithm of the likelihood of the data falls where the factors of a pair are as
         much larger as is likely best; 0 where they are not questioned."""

@@ -252,3 +252,10 @@ def test_a_file_of_something_else_is_left_alone(text, tmp_path, capsys):
     assert foreign.read_text() == text
     assert main([*SHORT, "--flights", str(tmp_path / "no" / "folder")]) == 1
     assert "cannot be written" in capsys.readouterr().err
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("row", ["wander", "wander-time"])
+def test_no_line_is_said_to_drift_where_the_attitude_wanders_farther_or_faster_than_stated(row):
+    """The forward line of these flights was, for ten seconds of the second strip."""
+    assert not fly("rtk", row, 11, 3, online=study_misspecified.ONLINE["nodes"]).accused

@@ -32,6 +32,7 @@ from triline.solver.window.datum.control import ControlTests
 from triline.solver.window.datum.drift_monitor import DRIFT_S, DriftMonitor
 from triline.solver.window.datum.drifts import Compensation, Named, estimated, of_block
 from triline.solver.window.results import AdjustedPoint, Look, WindowOptions
+from triline.solver.window.screening.sigma_check import SigmaCheck
 from triline.solver.window.state.maker import BatchMaker
 from triline.solver.window.state.unknowns import Border
 from triline.solver.window.window import Window
@@ -273,6 +274,17 @@ def test_a_source_that_drifts_as_a_whole_is_named_and_the_good_one_never_alone(f
     assert orientation_errors(simulation, result.whole).nees.mean() < 3.0
 
 
+def test_no_drift_is_named_where_a_larger_wander_is_the_better_explanation(flight, drifted, monkeypatch):
+    """In one of twenty flights whose attitude wandered twice as far as stated a healthy line was named for ten seconds.
+
+    What speaks for a wander is asked for where a test has failed, and is less than what speaks for a real drift.
+    """
+    simulation, poses = flight
+    assert drifted("N", 0, 0.05)[1]
+    monkeypatch.setattr(SigmaCheck, "gain_of_wanders", lambda *_: 1e4)
+    assert not _fly(_shifted(simulation, _drifting(0.0, 0.05), "N"), poses)[1]
+
+
 def test_no_drift_of_all_lines_is_named_where_control_and_gnss_differ(flight, monkeypatch):
     """All tie points contradict one of them then. With control 1.5 m off they were named as drifting for a while."""
     monkeypatch.setattr(ControlTests, "differs_from_gnss", property(lambda _: True))
@@ -357,6 +369,19 @@ def test_who_is_named_stays_so_until_another_is_decisively_better():
     assert told(4.0, F=0.2, N=0.6)[0] == GROUPS[1]
     assert told(5.0, N=0.14)[0] == GROUPS[1]  # below the limit, not cleared
     assert not told(6.0, N=0.01) and not told(7.0, N=0.6)
+
+
+def test_a_drift_is_named_anew_only_where_it_is_better_than_what_else_may_be_wrong():
+    suspicion, scores = Suspicion(), _scores({0: 0.4}, APART)
+    test, limit = scores.test(OF[0]), Suspicion().limit()
+
+    def named(now_s, instead):
+        return bool(suspicion.judge(now_s, scores, OF[:1], 1.0, instead))
+
+    assert test > limit + 5.0
+    assert not any(named(k, test - limit + 0.1) for k in range(8))
+    assert [named(8 + k, test - limit - 0.1) for k in range(3)] == [False, False, True]
+    assert named(12, 100.0)  # it stays named
 
 
 # ---- what it does
