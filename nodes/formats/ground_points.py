@@ -31,7 +31,13 @@ _COLUMNS = (
     Column("accuracy", "text", optional=True, blank=True),
     Column("level_accuracy", optional=True, blank=True, low=0.0),
     Column("enabled", "text", optional=True, choices=("1", "0", "True", "False", "true", "false")),
+    Column("type", "text", optional=True, blank=True),
 )
+#: Roles by what Pix4D calls them, in small letters without blanks.
+_ROLE_OF_TYPE = {
+    "3dgcp": "control", "gcp": "control", "2dgcp": "planimetric", "1dgcp": "height", "checkpoint": "check",
+    "3dcheckpoint": "check",
+}  # fmt: skip
 #: Control whose nearest point is farther from the flight, m, is in another CRS or of another flight.
 FAR_M = 50e3
 #: Pairs of names that are told.
@@ -61,6 +67,7 @@ _OTHER_NAMES = {
     "accuracy": ("accuracyx/y/z", "accuracy"),
     "level_accuracy": ("accuracyx/y", "horizontalaccuracy", "accuracyhorizontal", "accuracyhorz"),
     "enabled": ("enable", "enabled"),
+    "type": ("type",),
 }
 
 
@@ -68,9 +75,9 @@ def read_ground_table(path: Path, crs: str, notes: list[str], *, may_be_empty: b
     """The columns of a table of points in a CRS, for `known_points`.
 
     ``point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m,role`` and ``target_radius_m``, or names of other programs: of
-    Metashape ``Enable`` is 1 for control and 0 for a check point, one accuracy is for all axes. Without a role all
-    points are control, with a note. Lines of remarks (``# ...``) may stand above the header; a ``CoordinateSystem``
-    that they state must be the CRS.
+    Metashape ``Enable`` is 1 for control and 0 for a check point, one accuracy is for all axes; of Pix4D ``Type`` says
+    what a point is. Without a role all points are control, with a note. Lines of remarks (``# ...``) may stand above
+    the header; a ``CoordinateSystem`` that they state must be the CRS.
 
     Raises
     ------
@@ -83,7 +90,9 @@ def read_ground_table(path: Path, crs: str, notes: list[str], *, may_be_empty: b
             f"{path}:{skip + 1}: a list of OpenDroneMap (gcp_list.txt), with pixels of frame images and no sigmas, "
             "wanted a header with point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m"
         )
-    ours = {"enabled"} if "role" in header else set[str]()  # what stands for columns that are there says nothing
+    ours = (
+        {"enabled", "type"} if "role" in header else set[str]()
+    )  # what stands for columns that are there says nothing
     ours |= {"accuracy", "level_accuracy"} if set(_SIGMAS) <= set(header) else set()
     wanted = [column for column in _COLUMNS if column.name not in ours]
     columns = [_as_headed(column, header, crs, f"{path}:{skip + 1}") for column in wanted]
@@ -101,10 +110,24 @@ def read_ground_table(path: Path, crs: str, notes: list[str], *, may_be_empty: b
         enabled = np.isin(table["enabled"].astype(str), ("1", "True", "true"))
         values["role"] = np.where(enabled, "control", "check").astype(object)
     elif "role" not in table:
-        values["role"] = np.full(len(table), "control", dtype=object)
-        if len(table):
+        roles = _roles_of_types(table, notes) if "type" in table else None
+        values["role"] = np.full(len(table), "control", dtype=object) if roles is None else roles
+        if len(table) and roles is None:
             notes.append(f"{path.name}: no column role: all points are control")
     return replace(table, values=values | dict(table.values))
+
+
+def _roles_of_types(table: Table, notes: list[str]) -> NDArray[Any] | None:
+    """Roles (n,) by the types that Pix4D has; None, with a note, where none of them is one."""
+    types = table["type"]
+    roles = np.array([_ROLE_OF_TYPE.get(_small(word), "") for word in types], dtype=object)
+    if not (roles != "").any():
+        if len(table):
+            notes.append(f"{table.path.name}: column {table.headed.get('type', 'type')!r} is not known and was ignored")
+        return None
+    wanted = "wanted 3D GCP, 2D GCP, 1D GCP or Check Point"
+    table.refuse(roles == "", "type", lambda i: f"{repr(types[i]) if types[i] else 'missing'}, {wanted}")
+    return roles
 
 
 def _remarks(path: Path) -> int:

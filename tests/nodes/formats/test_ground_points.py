@@ -73,6 +73,29 @@ def test_one_accuracy_and_those_in_level_and_in_height(tmp_path):
         np.testing.assert_allclose(sigma, [[0.02, 0.02, 0.04]], rtol=1e-3)
 
 
+def test_types_of_pix4d_are_roles_and_others_are_ignored(tmp_path):
+    """A check point that counted as control would make the check worthless."""
+    head, row = "Label,Type,Easting,Northing,Altitude,Accuracy Horz,Accuracy Vert\n", "{},{},691000.5,533{}000,500,{}\n"
+
+    def roles(*types):
+        rows = "".join(row.format(f"P{i}", name, i, "0.02,0.04") for i, name in enumerate(types))
+        points, _, _, notes = read(tmp_path / "p4d.csv", head + rows)
+        return points.role, [note for note in notes if "Altitude" not in note]
+
+    assert roles("3D GCP", "2D GCP", "1D GCP", "Check Point", "3D check point") == (
+        ("control", "planimetric", "height", "check", "check"), [],
+    )  # fmt: skip
+    ignored = ["p4d.csv: column 'Type' is not known and was ignored", "p4d.csv: no column role: all points are control"]
+    assert roles("tree", "") == (("control", "control"), ignored)
+    for other, what in (("Manual Tie Point", "'Manual Tie Point'"), ("", "missing")):
+        with pytest.raises(
+            UserError, match=rf"p4d\.csv:3: Type: {what}, wanted 3D GCP, 2D GCP, 1D GCP or Check Point$"
+        ):
+            roles("3D GCP", other)
+    points, _, _, _ = read(tmp_path / "p4d.csv", head + row.format("P1", "Check Point", 1, ","))
+    assert points.role == ("check",)  # needs no accuracy
+
+
 EMLID = "Name,Easting,Northing,Elevation,Ellipsoidal height,Easting RMS,Northing RMS,Elevation RMS\n"
 FEET = "EPSG:2263"
 
