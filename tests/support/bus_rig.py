@@ -43,9 +43,15 @@ def here(*arguments: object) -> int:
 
 
 @functools.cache
+def _folder() -> tempfile.TemporaryDirectory:
+    """Goes when the process ends."""
+    return tempfile.TemporaryDirectory(prefix="triline-tests-")
+
+
+@functools.cache
 def simulated_flight(seconds: int = 8, attitude_hz: int = 200) -> Path:
     """A small flight: attitude, GNSS, tie points, control, truth."""
-    path = Path(tempfile.mkdtemp(prefix="triline-tests-")) / "flight.mcap"
+    path = Path(_folder().name) / f"flight-{seconds}-{attitude_hz}.mcap"
     plan = ("--sensor", "ads40", "--strips", 1, "--seconds", seconds, "--seed", 3, "--attitude-rate", attitude_hz)
     assert here("simulate", "-o", path, *plan, "-q") == 0
     return path
