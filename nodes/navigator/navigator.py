@@ -35,6 +35,9 @@ FROZEN_S = 1.0
 FAR_KM = 500.0
 #: Largest correction of GNSS times on an operator's word, s.
 LARGEST_CORRECTION_S = 100.0
+#: Attitudes and inertial data that are so far behind the newest ones, s, for so long, s, are of a clock that was set
+#: back (tuned: networks delay less, or hold up single messages).
+SET_BACK_S, SET_BACK_FOR_S = 2.0, 1.0
 #: Numbers of fixes that are missing without time going on: the clock was set back.
 FEW_NUMBERS = 5
 
@@ -99,6 +102,7 @@ class Navigator(Node):
         self._covariance = np.zeros((3, 3))
         self._clock = ClockCheck()
         self._newest_ns, self._other = 0, "attitude"
+        self._behind_since_ns: int | None = None
         self._inertial_came = False
         self._early_fix_ns = 0  # newest fix before the first attitude or inertial sample
         self._last_fix, self._period_s = (-1, 0), 0.0
@@ -237,7 +241,22 @@ class Navigator(Node):
             off_s = (time_ns - self._early_fix_ns) * 1e-9
             if abs(off_s) > EARLY_S:  # no fix since: those before were of another time
                 self._wrong_clock(offset_in_words(off_s, other))
+        self._tell_set_back(time_ns, other)
         self._newest_ns, self._other = max(self._newest_ns, time_ns), other
+
+    def _tell_set_back(self, time_ns: int, other: str) -> None:
+        """Tell an operator that nothing is navigated while attitude or inertial data tell times that have passed."""
+        if self._newest_ns - time_ns <= SET_BACK_S * convert.SECOND_NS:
+            self._behind_since_ns = None
+            if self.alarms.pop("set back", ""):
+                self._notes.append(self._log(self._stamp_ns, f"{other} is used again, its times go on"))
+            return
+        self._behind_since_ns = time_ns if self._behind_since_ns is None else self._behind_since_ns
+        if "set back" not in self.alarms and time_ns - self._behind_since_ns > SET_BACK_FOR_S * convert.SECOND_NS:
+            behind_s = (self._newest_ns - self._behind_since_ns) * 1e-9
+            text = f"the clock of {other} was set back by {behind_s:.0f} s: nothing is navigated until it is past that"
+            self._notes.append(self._log(self._stamp_ns, text, warning=True))
+            self.alarms["set back"] = text
 
     def _inertial(self, body: Any) -> list[NavigationPose]:
         if self._engine is None:

@@ -344,3 +344,24 @@ def test_attitudes_that_are_silent_accuse_no_clock_and_frozen_ones_are_not_used(
     assert "attitude changes again" in events and node.counters["attitude frozen"] > 100
     times = [convert.time_ns(b.timestamp) for b in poses if b.valid]
     assert not [t for t in times if half + 2 * SECOND < t < half + 4 * SECOND]
+
+
+def test_attitudes_of_a_clock_that_was_set_back_are_an_alarm_until_their_times_go_on():
+    """They are out of order, so that nothing is navigated; a single one that a link held up says nothing."""
+    attitudes = [m for m in flight() if m.topic == "sensor/attitude"]
+    half = len(attitudes) // 2
+
+    def back(message: Message, seconds: float) -> Message:
+        body = type(message.body)()
+        body.CopyFrom(message.body)
+        body.time_ns -= round(seconds * SECOND)
+        return Message(message.topic, message.stamp_ns, body, message.source, message.sequence)
+
+    before = [m for m in flight() if m.stamp_ns < attitudes[half].stamp_ns]
+    node, events, _ = heard([*before, back(attitudes[half], 5.0), attitudes[half + 1]])
+    assert not events and not node.alarm
+    node, events, _ = heard([*before, *(back(m, 10.0) for m in attitudes[half : half + 100])])
+    told = "the clock of attitude was set back by 10 s: nothing is navigated until it is past that"
+    assert events == [told] and node.alarm == told
+    node, events, _ = heard(attitudes[half + 100 :], node)
+    assert events[0] == "attitude is used again, its times go on" and not node.alarm
