@@ -44,6 +44,8 @@ APART_NS, LOOKED_AT_S = 1_000_000_000, 10.0
 CATCH_UP_S = 2.5
 #: Who is on a port that is taken answers within so long; nodes of a flight that was killed have ended after so long, s.
 MEET_S, ENDED_S = 2.0, 5.0
+#: Counters of estimating nodes whose first case is told: of what sensors send.
+_TOLD_OF_NODES = ("malformed", "attitude jump", "inertial noise")
 SOURCE = "flight"
 FILE = "flight.toml"
 
@@ -277,14 +279,14 @@ class Fly(LiveFlight):
             )
 
     def _tell_problems(self) -> None:
-        """Show what sensor programs refuse or lack, and what nodes refuse, when it comes first."""
+        """Show what sensor programs refuse or lack, and what nodes hold against sensors, when it comes first."""
         assert self.watch is not None
         for id in (*self.programs, *self.estimators):
             status = self._overview.nodes.get(id)
             if status is None:
                 continue
             for counter in status.counters:
-                if (id in self.programs or counter.name == "malformed") and (id, counter.name) not in self._told:
+                if (id in self.programs or counter.name in _TOLD_OF_NODES) and (id, counter.name) not in self._told:
                     self._told.add((id, counter.name))
                     self.watch.tell(f"{id}: {counter.name}: {last_of(status, counter)}")
 

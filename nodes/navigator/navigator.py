@@ -10,6 +10,7 @@ import numpy as np
 
 from ...solver.geometry.frames import LocalFrame
 from ...solver.geometry.rotation import R_ENU_NED
+from ...solver.navigation.attitude_jumps import AttitudeJumps
 from ...solver.navigation.clock_check import LARGEST_DELAY_S, ClockCheck, offset_in_words
 from ...solver.navigation.clock_offset import OffsetWatch
 from ...solver.navigation.gnss_fix import local_fix
@@ -30,6 +31,8 @@ EARLY_S = 900.0
 #: Attitudes that have not changed in any digit for so long, s, are those of a sensor that hangs (tuned: sensors that
 #: round to 0.01 deg repeat themselves for some samples).
 FROZEN_S = 1.0
+#: Jumps of the attitude are told again after so long, s: those of a heading that is not known yet may be many.
+JUMP_TOLD_S = 60.0
 #: Fixes that lie so far from the origin of the project, km over ground, are told: no block is as large, the project is
 #: that of another place, or latitude and longitude are exchanged.
 FAR_KM = 500.0
@@ -98,6 +101,7 @@ class Navigator(Node):
         self._notes: list[Message] = []
         self._frame = LocalFrame(0.0, 0.0, 0.0)
         self._same = 0, (np.nan, np.nan, np.nan)  # since when the attitude has been the same
+        self._jumps, self._told_jump_ns = AttitudeJumps(), -(1 << 62)
         self._covariance_key: tuple[float, ...] = ()
         self._covariance = np.zeros((3, 3))
         self._clock = ClockCheck()
@@ -294,7 +298,7 @@ class Navigator(Node):
         self._note_time(body.time_ns, "attitude")
         rpy = (body.roll, body.pitch, body.heading)
         convert.check_angles(*rpy)
-        if self._is_frozen(body.time_ns, rpy):
+        if self._is_frozen(body.time_ns, rpy) or self._has_jumped(body.time_ns, rpy):
             return []
         self._offset.sample(self._seconds(body.time_ns), *rpy)
         return self._engine.add_attitude(self._seconds(body.time_ns), rpy, self._attitude_covariance(body.covariance))
@@ -315,6 +319,17 @@ class Navigator(Node):
             self._notes.append(self._log(self._stamp_ns, text, warning=True))
         self.alarms["frozen"] = text
         return True
+
+    def _has_jumped(self, time_ns: int, rpy: tuple[float, float, float]) -> bool:
+        """Whether no aircraft can have turned to an attitude: then it is no measurement."""
+        left_out = self._jumps.is_left_out(self._seconds(time_ns), rpy)
+        if left_out:
+            text = f"attitude jumps by {self._jumps.by_deg:.1f} deg: left out until it goes on from before, or stays so"
+            self.problem("attitude jump", f"sensor/attitude: {text}")
+            if time_ns > self._told_jump_ns + JUMP_TOLD_S * convert.SECOND_NS:
+                self._notes.append(self._log(self._stamp_ns, text, warning=True))
+                self._told_jump_ns = time_ns
+        return left_out
 
     def _attitude_covariance(self, values: Any) -> Any:
         """(3, 3); the array of the last message again if it had the same values, so that nothing is computed twice."""

@@ -365,3 +365,24 @@ def test_attitudes_of_a_clock_that_was_set_back_are_an_alarm_until_their_times_g
     assert events == [told] and node.alarm == told
     node, events, _ = heard(attitudes[half + 100 :], node)
     assert events[0] == "attitude is used again, its times go on" and not node.alarm
+
+
+def test_attitudes_that_no_aircraft_can_have_turned_to_are_not_published():
+    """Headings 90 deg off for a fifth of a second were poses with a sigma of hundredths."""
+    attitudes = [m for m in flight() if m.topic == "sensor/attitude"]
+    spoilt = {m.sequence for m in attitudes[len(attitudes) // 2 :][:10]}
+    messages = []
+    for message in flight():
+        if message.topic == "sensor/attitude" and message.sequence in spoilt:
+            body = type(message.body)()
+            body.CopyFrom(message.body)
+            body.heading = (body.heading + np.pi / 2) % (2 * np.pi)
+            message = Message(message.topic, message.stamp_ns, body, message.source, message.sequence)
+        messages.append(message)
+    node, events, poses = heard(messages)
+    assert "attitude jumps by 90.0 deg: left out until it goes on from before, or stays so" in events
+    assert node.counters["attitude jump"] == 10 and not node.alarm
+    right = {convert.time_ns(b.timestamp): convert.pose_sample(b).quaternion for b in right_poses()}
+    for body in poses:
+        cosine = abs(np.dot(convert.pose_sample(body).quaternion, right[convert.time_ns(body.timestamp)]))
+        assert np.degrees(2.0 * np.arccos(min(cosine, 1.0))) < 0.1
