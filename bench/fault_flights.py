@@ -41,7 +41,7 @@ class Flown:
 
     @classmethod
     def simulated(cls, path: Path, *options: str) -> Flown:
-        plan = ("--seconds", str(SECONDS), "--control", "9", "--seed", "3")
+        plan = ("--seconds", str(SECONDS), "--control", "9", "--seed", "1")
         frame.triline("simulate", "-o", str(path), *plan, *options, "-q")
         messages = list(RecordingReader(path).sorted_messages())
         return cls(path, messages, next(m.stamp_ns for m in messages if m.topic == "sensor/attitude"))

@@ -169,7 +169,7 @@ def process(messages: Iterable[Message], folder: Path, *options: str) -> list[Pa
     for message in sorted(messages, key=lambda m: m.stamp_ns):
         writer.write(message)
     writer.close()
-    frame.triline("process", str(source), "-o", str(out), "-q", *options)
+    frame.triline("process", str(source), "-o", str(out), "--pace", "load", "-q", *options)  # live as in a flight
     return [out]
 
 
@@ -231,6 +231,10 @@ def of_data(start_ns: int) -> dict[str, Callable[[Messages], Messages]]:
             changed(m, roll=float("nan")) if m.topic == "sensor/attitude" and during(m, 5.0) else m for m in ms
         ],
         "attitude frozen, 5 s": frozen,
+        "heading 20 deg off, 0.3 s": lambda ms: [
+            changed(m, heading=m.body.heading + 0.35) if m.topic == "sensor/attitude" and during(m, 0.3) else m
+            for m in ms
+        ],
         "GNSS silent, 5 s": lambda ms: [m for m in ms if not (m.topic == "sensor/gnss" and during(m, 5.0))],
         "attitude lost, one of ten": lambda ms: [
             m for m in ms if m.topic != "sensor/attitude" or not during(m, 20.0) or rng.random() > 0.1
