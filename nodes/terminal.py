@@ -13,7 +13,7 @@ import shutil
 import sys
 import unicodedata
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, TextIO, cast
 
 #: Categories of Unicode that are written as escapes: control, surrogate, private use, not assigned, and separators that
@@ -105,6 +105,39 @@ class _Closed(io.TextIOBase):
         if self._wanted:
             raise BrokenPipeError
         return len(text)
+
+
+class _Lasting:
+    """A text stream of which what cannot be written any more goes nowhere."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            self.stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            self.stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
+@contextmanager
+def whoever_reads() -> Iterator[None]:
+    """In this block work goes on when what it says on standard output cannot be written any more.
+
+    The terminal was closed, the program behind a pipe (``| tee``) was ended by the same Ctrl-C, or a disk is full.
+    """
+    out = sys.stdout
+    sys.stdout = cast(TextIO, CleanStream(cast(TextIO, _Lasting(drawing(out)))))
+    try:
+        yield
+    finally:
+        sys.stdout = out
 
 
 @contextmanager

@@ -26,6 +26,7 @@ from ..formats.new_file import refuse_unless_folder
 from ..last_problems import last_of
 from ..monitor.monitor import ENDING, display
 from ..step_driver import failure_words
+from ..terminal import whoever_reads
 
 if TYPE_CHECKING:
     from ..bus.bundle import Bundle, ExpiryWatch
@@ -123,7 +124,7 @@ class LiveFlight:
     def fly(self) -> dict[str, Any]:
         """Run the flight; returns the evaluation of its recording. Nobody else writes into its folder meanwhile."""
         refuse_unless_folder(self.folder)
-        with locked(self.folder):
+        with locked(self.folder), whoever_reads():
             return self._fly()
 
     def _fly(self) -> dict[str, Any]:

@@ -1,25 +1,30 @@
-"""What a live flight says at its end."""
+"""What a live flight says at its end, and that it comes there."""
 
 from __future__ import annotations
 
 import argparse
+import errno
+import io
 import shlex
+import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import pytest
+
 from triline.nodes.cli import main
 from triline.nodes.cli.demo import Demo
 from triline.nodes.cli.live_flight import LiveFlight, failed_nodes
-from triline.nodes.monitor.monitor import Overview
+from triline.nodes.monitor.monitor import ENDING, Overview, display
 from triline.schemas import messages as m
 
 RESULT = {"lost": {}, "waited_s": 0.0}
 
 
-def demo(folder: Path) -> Demo:
+def demo(folder: Path, quiet: bool = True) -> Demo:
     options = {"no_images": False, "seed": 1, "secure": None, "web": False, "headless": True}
-    return Demo(argparse.Namespace(output=folder, quiet=True, json=False, **options))
+    return Demo(argparse.Namespace(output=folder, quiet=quiet, json=False, **options))
 
 
 def test_commands_at_the_end_of_a_flight_can_be_pasted(tmp_path):
@@ -74,6 +79,37 @@ def test_a_file_is_neither_a_flight_nor_a_folder_of_results(tmp_path, capsys):
         assert main(words) == 1
         assert said in capsys.readouterr().err
     assert file.read_text() == "mine"
+
+
+class Gone(io.StringIO):
+    """A terminal that was closed, or a pipe whose reader has ended."""
+
+    def __init__(self, terminal: bool) -> None:
+        super().__init__()
+        self.isatty = lambda: terminal
+
+    def write(self, text: str) -> int:
+        raise OSError(errno.EIO, "Input/output error") if self.isatty() else BrokenPipeError
+
+    def flush(self) -> None:
+        self.write("")
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_flight_lands_when_nobody_reads_any_more_what_it_says(tmp_path, monkeypatch, terminal):
+    """Behind `| tee` Ctrl-C ended both programs, and in a closed terminal the flight ended as by a failure."""
+    flight, out = demo(tmp_path, quiet=False), Gone(terminal)
+
+    def fly_and_land():
+        with display(Overview(), "flight") as show:
+            show()
+            flight.say(ENDING)
+        return {"landed": True}
+
+    monkeypatch.setattr(flight, "_fly", fly_and_land)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr("sys.stdout", out)
+    assert flight.fly() == {"landed": True} and sys.stdout is out
 
 
 def test_a_node_is_stopped_when_it_has_worked_off_what_came_however_much_it_holds_back():
