@@ -122,8 +122,14 @@ def end_by_signal(stop: threading.Event) -> Callable[[int, object], None]:
     return handle
 
 
+def ending_signals() -> list[signal.Signals]:
+    """Signals that ask for a clean end: Ctrl-C, SIGTERM, and a closed terminal unless that is ignored (`nohup`)."""
+    hangup = [signal.SIGHUP] if hasattr(signal, "SIGHUP") else []
+    return [signal.SIGINT, signal.SIGTERM, *(n for n in hangup if signal.getsignal(n) is not signal.SIG_IGN)]
+
+
 def stop_on_signals(stop: threading.Event) -> None:
-    """SIGINT and SIGTERM ask for a clean end; the third one ends at once."""
+    """`ending_signals` ask for a clean end; the third one ends at once."""
     end, count = end_by_signal(stop), 0
 
     def handle(number: int, frame: object) -> None:
@@ -133,5 +139,5 @@ def stop_on_signals(stop: threading.Event) -> None:
         if count > 2:
             sys.exit(1)
 
-    signal.signal(signal.SIGINT, handle)
-    signal.signal(signal.SIGTERM, handle)
+    for number in ending_signals():
+        signal.signal(number, handle)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -46,11 +47,16 @@ def bus_of(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def reporter(quiet: bool) -> Callable[[str], None]:
-    """A function that prints a line on standard error, or nothing with --quiet."""
+    """A function that prints a line on standard error, or nothing with --quiet.
+
+    Work goes on where that cannot be written any more: its terminal was closed, ``2>&1 | tee`` has ended, the disk of
+    the log is full.
+    """
 
     def report(text: str) -> None:
         if not quiet:
-            print(plain(text), file=sys.stderr, flush=True)
+            with suppress(OSError):
+                print(plain(text), file=sys.stderr, flush=True)
 
     return report
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from ...schemas.topics import TOPICS, may_be_dropped
 from ..bus.folder_lock import locked
 from ..bus.processes import NodeGroup, NodeProcess
-from ..bus.program import end_by_signal
+from ..bus.program import end_by_signal, ending_signals
 from ..errors import UserError
 from ..formats.new_file import refuse_unless_folder
 from ..last_problems import last_of
@@ -414,9 +414,8 @@ def failed_nodes(statuses: Mapping[str, Any]) -> dict[str, str]:
 @contextmanager
 def _interruptible(stop: threading.Event) -> Iterator[None]:
     """Make Ctrl-C, SIGTERM and a closed terminal end the flight in good order."""
-    numbers = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
     handle = end_by_signal(stop)
-    previous = {number: signal.signal(number, handle) for number in numbers}
+    previous = {number: signal.signal(number, handle) for number in ending_signals()}
     try:
         yield
     finally:

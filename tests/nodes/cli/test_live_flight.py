@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import pytest
 
 from triline.nodes.cli import main
+from triline.nodes.cli.bus_options import reporter
 from triline.nodes.cli.demo import Demo
 from triline.nodes.cli.live_flight import LiveFlight, failed_nodes
 from triline.nodes.monitor.monitor import ENDING, Overview, display
@@ -110,6 +111,11 @@ def test_a_flight_lands_when_nobody_reads_any_more_what_it_says(tmp_path, monkey
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr("sys.stdout", out)
     assert flight.fly() == {"landed": True} and sys.stdout is out
+
+
+def test_a_node_goes_on_when_nobody_reads_any_more_what_it_says(monkeypatch):
+    monkeypatch.setattr("sys.stderr", Gone(terminal=True))
+    reporter(quiet=False)("recording to flight.mcap")
 
 
 def test_a_node_is_stopped_when_it_has_worked_off_what_came_however_much_it_holds_back():
