@@ -26,7 +26,7 @@ from ..formats.new_file import refuse_unless_folder
 from ..last_problems import last_of
 from ..monitor.monitor import ENDING, display
 from ..step_driver import failure_words
-from ..terminal import whoever_reads
+from ..terminal import plain, whoever_reads
 
 if TYPE_CHECKING:
     from ..bus.bundle import Bundle, ExpiryWatch
@@ -75,7 +75,8 @@ class LiveFlight:
         self.folder: Path = args.output
         self.recording = self.folder / "flight.mcap"
         self.stop = threading.Event()
-        self.restarts = 0
+        self._restarted: Counter[str] = Counter()  # by node, how often it was started again
+        self._not_recorded = (0, "")  # how many messages, and why
         self.watch: SensorWatch | None = None
         self._lost: dict[str, int] = {}
         self._failed: dict[str, str] = {}  # by node, of which part of the work failed
@@ -217,12 +218,13 @@ class LiveFlight:
                         self._sensor_ended(dead)
                         del group.processes[dead.name]
                     continue
-                if dead.name == "viewer":  # the user closed its window
+                if dead.name == "viewer":
+                    if self.viewer_mode != "native":  # else the user closed its window
+                        self._tell(f"viewer has ended: {dead.last_line()}; nothing more comes into the scene")
                     del group.processes["viewer"]
                     continue
-                self.restarts += 1
-                if self.watch is not None:
-                    self.watch.tell(f"{dead.name} has ended, and is started again")
+                self._restarted[dead.name] += 1
+                self._tell(f"{dead.name} has ended: {dead.last_line()}; it is started again")
                 recorder = dead.name == "recorder"
                 group.start(
                     dead.name, *(("-o", str(self._next_recording())) if recorder else self.node_arguments(dead.name))
@@ -233,6 +235,13 @@ class LiveFlight:
         for id in self.sensor_ids():
             if id in group.processes:
                 group.processes[id].stop()
+
+    def _tell(self, text: str) -> None:
+        """Say what has happened in flight."""
+        if self.watch is not None:
+            self.watch.tell(text)
+        else:
+            self.say(plain(text))
 
     def _tell_expiry(self) -> None:
         """On the screen, where it comes nearer that the certificate expires, and when it has."""
@@ -269,6 +278,7 @@ class LiveFlight:
         show()
         self._lost = late | self._lost_so_far(("gaps", "malformed", "dropped"))
         self._failed = failed_nodes(overview.nodes)
+        self._not_recorded = not_recorded(overview.nodes.get("recorder"))
 
     @staticmethod
     def _wait_until_worked_off(node: NodeProcess, overview: Overview, show: Callable[[], None], until: float) -> None:
@@ -330,7 +340,8 @@ class LiveFlight:
             except (UserError, OSError) as error:  # a full disk, for one: what was recorded is said all the same
                 result = {"no_report": str(error)}
         result.update(
-            recordings=[str(path) for path in recordings], restarts=self.restarts,
+            recordings=[str(path) for path in recordings], restarts=self._restarted.total(),
+            restarted=dict(self._restarted), not_recorded=self._not_recorded[0],
             landed_early=self.stop.is_set(), viewer=self.viewer_mode, lost=self._lost, failed=self._failed,
         )  # fmt: skip
         return result
@@ -369,15 +380,24 @@ class LiveFlight:
         if result["lost"]:
             lines.append("lost or late: " + ", ".join(f"{what} {n}" for what, n in result["lost"].items()))
         lines += [f"{name}: {text} (see {self.folder / 'log'})" for name, text in result.get("failed", {}).items()]
-        if self.restarts:
-            lines.append(f"{self.restarts} nodes were started again")
-        if others := [path for path in result["recordings"] if path != str(self.recording)]:
-            lines.append(f"this page is of the largest recording alone; the flight goes on in {', '.join(others)}")
+        if result.get("not_recorded"):
+            lines.append(f"NOT RECORDED: {result['not_recorded']} messages: {self._not_recorded[1]}")
+        if restarted := result.get("restarted"):
+            often = (f"{name} {n} times" if n > 1 else name for name, n in restarted.items())
+            lines.append(f"had ended, and started again: {', '.join(often)}")
+        parts = result["recordings"]
+        if others := [path for path in parts if path != str(self.recording)]:
+            lines.append(
+                f"this page is of the largest recording alone; another part of the flight: {', '.join(others)}"
+            )
         lines += ["", f"recording  {self.recording}"]
         lines += [f"report     {result['report']}"] if "report" in result else []
         recording, processed = shlex.quote(str(self.recording)), shlex.quote(str(self.folder / "processed.mcap"))
         if self.viewer_mode.startswith("rrd:"):
             lines.append(f"scene      {self.viewer_mode[4:]}   (no display: open it with `triline view {recording}`)")
+        if others:
+            whole = shlex.quote(str(self.folder / "whole.mcap"))
+            lines.append(f"join them  triline recover {shlex.join(parts)} -o {whole}")
         lines += [
             f"replay it  triline replay {recording}",
             f"again      triline process {recording} -o {processed} --nodes {','.join(self.estimators)}"
@@ -409,6 +429,14 @@ def failed_nodes(statuses: Mapping[str, Any]) -> dict[str, str]:
             if counter.name == "failed" and counter.value:
                 failed[name] = failure_words(counter.value, f"its last problem: {last_of(status, counter)}")
     return failed
+
+
+def not_recorded(status: Any) -> tuple[int, str]:
+    """How many messages the recorder lost, by its newest status (or None), and what it said of its disk."""
+    counters = {} if status is None else {counter.name: counter for counter in status.counters}
+    if "lost" not in counters:
+        return 0, ""
+    return counters["lost"].value, last_of(status, counters["disk"] if "disk" in counters else counters["lost"])
 
 
 @contextmanager

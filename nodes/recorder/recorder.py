@@ -282,6 +282,14 @@ class Recorder(Node):
         except OSError as error:
             self._fail(error)
 
+    def account(self) -> str:
+        """What is in which files, and what is not."""
+        lost = self.counters["lost"]
+        total = sum(counts.received for counts in self.statistics.values()) - lost
+        names = ", ".join(str(path) for path in self.files if path.exists()) or "no file"
+        said = f"{total} messages in {names}; {self.missing} missing by number"
+        return said + (f"; {lost} others were lost" if lost else "")
+
     # ---- files
 
     def _open(self) -> None:
@@ -472,11 +480,7 @@ def run(options: ProgramOptions) -> int:
     with options.open_bus() as bus:
         record(recorder, bus, options)
     recorder.close()
-    counts = recorder.statistics
-    total = sum(c.received for c in counts.values())
-    lost = f", {recorder.counters['lost']} lost" if recorder.counters["lost"] else ""
-    names = ", ".join(str(path) for path in recorder.files if path.exists()) or "no file"
-    options.report(f"{total} messages in {names}; {recorder.missing} missing by number{lost}")
+    options.report(recorder.account())
     return 1 if recorder.counters["disk"] else 0
 
 

@@ -253,6 +253,7 @@ def test_a_recording_that_is_deleted_at_last_is_told(tmp_path):
     recorder.close()
     assert recorder.counters["disk"] == 1 and recorder.counters["lost"] == 20
     assert recorder.last_problem == f"{tmp_path / 'a.mcap'}: was deleted while it was written"
+    assert recorder.account() == "0 messages in no file; 0 missing by number; 20 others were lost"
 
 
 def test_a_disk_that_numbers_its_files_anew_has_deleted_none(tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ import pytest
 from triline.nodes.cli import main
 from triline.nodes.cli.bus_options import reporter
 from triline.nodes.cli.demo import Demo
-from triline.nodes.cli.live_flight import LiveFlight, failed_nodes
+from triline.nodes.cli.live_flight import LiveFlight, failed_nodes, not_recorded
 from triline.nodes.monitor.monitor import ENDING, Overview, display
 from triline.schemas import messages as m
 
@@ -43,7 +43,41 @@ def test_a_flight_in_several_recordings_names_those_that_its_page_leaves_out(tmp
     """The recorder was killed and started again, and wrote a file of its own from then on."""
     recordings = [str(tmp_path / name) for name in ("flight.mcap", "flight-2.mcap")]
     said = demo(tmp_path).summary({**RESULT, "recordings": recordings})
-    assert f"of the largest recording alone; the flight goes on in {recordings[1]}\n" in said
+    assert f"of the largest recording alone; another part of the flight: {recordings[1]}\n" in said
+    (join,) = (line for line in said.splitlines() if line.startswith("join them"))
+    words = shlex.split(join.removeprefix("join them"))
+    assert words == ["triline", "recover", *recordings, "-o", str(tmp_path / "whole.mcap")]
+
+
+def test_what_was_not_recorded_is_told_at_the_end(tmp_path, monkeypatch):
+    """The folder was deleted in flight: the page was of what came later, and nothing said so."""
+    status, flight = m.NodeStatus(node="recorder", last_problem="recording again"), demo(tmp_path)
+    assert not_recorded(None) == not_recorded(status) == (0, "")
+    why = f"{tmp_path}/flight.mcap: was deleted while it was written"
+    status.counters.add(name="disk", value=1, last_problem=why)
+    status.counters.add(name="lost", value=10225)
+    flight._not_recorded = not_recorded(status)
+    (tmp_path / "flight_0001.mcap").write_text("no recording")
+    result = {**LiveFlight._evaluate(flight), "waited_s": 0.0}
+    assert result["not_recorded"] == 10225
+    assert f"\nNOT RECORDED: 10225 messages: {why}\n" in flight.summary(result)
+
+
+def test_nodes_that_end_are_named_in_flight_and_at_its_end(tmp_path, monkeypatch, capsys):
+    flight, started = demo(tmp_path, quiet=False), []
+    flight.viewer_mode = "rrd:flight.rrd"
+    nodes = {n: SimpleNamespace(name=n, last_line=lambda: "killed by SIGKILL") for n in ("recorder", "viewer")}
+    dead = [list(nodes.values())]
+    group = SimpleNamespace(
+        processes=nodes, dead=lambda: dead.pop(), start=lambda name, *words: started.append((name, *words))
+    )
+    monkeypatch.setattr(flight, "over", lambda group: not dead)
+    flight._watch(group, None, lambda: None)
+    assert started == [("recorder", "-o", str(tmp_path / "flight-1.mcap"))] and list(nodes) == ["recorder"]
+    told = "recorder has ended: killed by SIGKILL; it is started again\nviewer has ended: killed by SIGKILL; nothing"
+    assert capsys.readouterr().out.startswith(told)
+    said = flight.summary({**RESULT, "recordings": [], "restarted": {"recorder": 1, "adjuster": 2}})
+    assert "\nhad ended, and started again: recorder, adjuster 2 times\n" in said
 
 
 def test_a_flight_whose_report_cannot_be_made_says_what_was_recorded(tmp_path):
