@@ -76,6 +76,7 @@ class LiveFlight:
         self.recording = self.folder / "flight.mcap"
         self.stop = threading.Event()
         self._restarted: Counter[str] = Counter()  # by node, how often it was started again
+        self._killed: dict[str, str] = {}  # nodes that did not end by themselves, and what killed them
         self._not_recorded = (0, "")  # how many messages, and why
         self.watch: SensorWatch | None = None
         self._lost: dict[str, int] = {}
@@ -274,7 +275,10 @@ class LiveFlight:
             if name in group.processes:
                 node = group.processes[name]
                 self._wait_until_worked_off(node, overview, show, until)
-                node.stop(LAST_WORK_S, self.folder if name == "recorder" else None)
+                if overview.is_silent(name):
+                    self.say(f"{name} is silent: it has {LAST_WORK_S:.0f} s to end")
+                if node.stop(LAST_WORK_S, self.folder if name == "recorder" else None) < 0:
+                    self._killed[name] = node.last_line()
         show()
         self._lost = late | self._lost_so_far(("gaps", "malformed", "dropped"))
         self._failed = failed_nodes(overview.nodes)
@@ -341,7 +345,7 @@ class LiveFlight:
                 result = {"no_report": str(error)}
         result.update(
             recordings=[str(path) for path in recordings], restarts=self._restarted.total(),
-            restarted=dict(self._restarted), not_recorded=self._not_recorded[0],
+            restarted=dict(self._restarted), not_recorded=self._not_recorded[0], killed=self._killed,
             landed_early=self.stop.is_set(), viewer=self.viewer_mode, lost=self._lost, failed=self._failed,
         )  # fmt: skip
         return result
@@ -382,6 +386,8 @@ class LiveFlight:
         lines += [f"{name}: {text} (see {self.folder / 'log'})" for name, text in result.get("failed", {}).items()]
         if result.get("not_recorded"):
             lines.append(f"NOT RECORDED: {result['not_recorded']} messages: {self._not_recorded[1]}")
+        for name, text in result.get("killed", {}).items():
+            lines.append(f"{name} did not end by itself, and was {text}: what it held back is missing")
         if restarted := result.get("restarted"):
             often = (f"{name} {n} times" if n > 1 else name for name, n in restarted.items())
             lines.append(f"had ended, and started again: {', '.join(often)}")

@@ -152,6 +152,25 @@ def test_a_node_goes_on_when_nobody_reads_any_more_what_it_says(monkeypatch):
     reporter(quiet=False)("recording to flight.mcap")
 
 
+def test_a_node_that_stands_still_at_the_end_is_named(tmp_path, capsys):
+    """A navigator that was frozen: the flight waited 45 s for it, and said neither that nor that it was killed."""
+    flight, overview = demo(tmp_path, quiet=False), Overview()
+    codes, why = {"navigator": -9, "adjuster": 0, "recorder": 0}, "killed by SIGKILL"
+    nodes = {
+        name: SimpleNamespace(name=name, running=False, stop=lambda *_, code=code: code, last_line=lambda: why)
+        for name, code in codes.items()
+    }
+    group = SimpleNamespace(processes=nodes)
+    for name in ("navigator", *["adjuster"] * 20):
+        overview.take_status(name, m.NodeStatus(node=name))
+    flight._overview = overview
+    flight._land(group, overview, lambda: None)
+    assert capsys.readouterr().out.splitlines() == [ENDING, "navigator is silent: it has 45 s to end"]
+    (tmp_path / "flight.mcap").write_text("no recording")
+    said = flight.summary({**LiveFlight._evaluate(flight), "waited_s": 0.0})
+    assert "\nnavigator did not end by itself, and was killed by SIGKILL: what it held back is missing\n" in said
+
+
 def test_a_node_is_stopped_when_it_has_worked_off_what_came_however_much_it_holds_back():
     """Lines that waited for a trajectory which had ended counted as work to do: every flight took ten seconds more."""
     told = [(100, 604), (180, 604), (180, 420), (180, 404), (180, 404), (180, 404), (180, 404)]  # received, queued
