@@ -84,6 +84,7 @@ class SensorWatch:
         self._clock = clock
         self._topics: dict[str, _Topic] = {}
         self._status: Any = None  # counted already
+        self._counted_s = 0.0  # when it came: what has come since then nobody knows
         self._states: dict[str, str] = {}
         self._pending: list[str] = []
         self.phase = ""
@@ -101,7 +102,12 @@ class SensorWatch:
         """
         now = self._clock()
         status = nodes.get(COUNTS)
-        new, self._status = status is not self._status, status
+        new, before, self._status = status is not self._status, self._status, status
+        if new and status is not None:
+            if before is not None and status.uptime_s < before.uptime_s:  # nobody counted until it was started again
+                for known in self._topics.values():
+                    known.heard_s += now - self._counted_s
+            self._counted_s = now
         for topic in status.topics if new and status is not None else ():
             if topic.topic.startswith(("sensor/", "trajectory/")) and (
                 topic.topic.startswith("sensor/") or self._is_awaited(topic.topic)
@@ -111,15 +117,14 @@ class SensorWatch:
                 known.lost = int(topic.gaps + topic.malformed)
         lines, self._pending = self._pending, []
         for row in self.rows():
-            before = self._states.get(row.name, NEVER)
-            if row.state != before and not (ending and row.state == STOPPED):
+            if row.state != self._states.get(row.name, NEVER) and not (ending and row.state == STOPPED):
                 lines.append(f"{row.name} {row.words if row.state == STOPPED else row.state}")
             self._states[row.name] = row.state
         return lines
 
     def rows(self) -> list[SensorRow]:
         """A row for what is awaited, then for what comes beside it."""
-        now, rows, shown = self._clock(), [], set()
+        now, rows, shown = self._counted_s, [], set()
         for group in self._awaited:
             present = [name for name in group if name in self._topics and self._topics[name].received]
             shown.update(present)

@@ -432,7 +432,7 @@ def test_what_comes_in_and_what_is_missing():
                 )
                 for name, n in counted.items()
             ]  # fmt: skip
-            status = SimpleNamespace(topics=topics)
+            status = SimpleNamespace(topics=topics, uptime_s=now[0] - begun[0])
             lines += watch.look({"recorder": status}, ending=ending)
             now[0] += 0.2  # it looks more often than a status comes
             lines += watch.look({"recorder": status}, ending=ending)
@@ -440,16 +440,20 @@ def test_what_comes_in_and_what_is_missing():
         return lines
 
     counted: dict[str, int] = {}
+    begun = [0.0]
     assert look(1) == [] and watch.never == ["sensor/gnss", "sensor/imu or sensor/attitude", "sensor/lines/N"]
     assert look(6, gnss=4, attitude=100) == ["sensor/gnss comes in", "sensor/attitude comes in"]
     assert watch.line().startswith("sensor/gnss 4.0/s, sensor/attitude 100.0/s; sensor/lines/N never seen")
     (stopped,) = look(8, attitude=100)
     assert stopped.startswith("sensor/gnss stopped") and watch.never == ["sensor/lines/N"]
     assert look(2, gnss=4, attitude=100) == ["sensor/gnss comes in"]
-    # a recorder that is started again counts from 0
+    # a recorder that is started again counts from 0, and what nobody counted meanwhile has not stopped
     before = {row.name: row.received for row in watch.rows()}
     counted.clear()
-    look(2, gnss=4, attitude=100)
+    now[0] += 4.0
+    assert watch.look({"recorder": watch._status}) == []
+    begun[0] = now[0]
+    assert look(1) == [] and look(2, gnss=4, attitude=100) == []
     after = {row.name: row.received for row in watch.rows()}
     assert after["sensor/gnss"] == before["sensor/gnss"] + 8 and watch.never == ["sensor/lines/N"]
     watch.tell("gnss has ended: no such port")
@@ -463,13 +467,13 @@ def test_rates_are_those_that_the_recorder_measures():
     """Counts that change every 0.53 s, looked at every 0.25 s, made between 89 and 106 Hz of 100."""
     now = [0.0]
     watch = SensorWatch([("sensor/attitude",)], lambda: now[0])
-    told, status = [], SimpleNamespace(topics=[])
+    told, status = [], SimpleNamespace(topics=[], uptime_s=0.0)
     for look in range(120):
         now[0] = 0.25 * look
         received = int(100 * 0.53 * (now[0] // 0.53))
         if not status.topics or status.topics[0].received != received:
             topic = SimpleNamespace(topic="sensor/attitude", received=received, gaps=0, malformed=0, rate_hz=100.0)
-            status = SimpleNamespace(topics=[topic])
+            status = SimpleNamespace(topics=[topic], uptime_s=now[0])
         watch.look({"recorder": status})
         told += [row.rate_hz for row in watch.rows() if now[0] > 6.0]
     assert min(told) == max(told) == 100.0
