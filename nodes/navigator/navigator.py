@@ -229,13 +229,14 @@ class Navigator(Node):
         if self._set_back is not None and number >= self._set_back:
             self.counters["gnss of another clock"] += 1
             return True
-        if number == last + 1:
+        if number == last + 1 and last >= 0:
             self._period_s = (time_ns - last_ns) * 1e-9
         elif number > last + FEW_NUMBERS and last >= 0 and 0 <= time_ns - last_ns < convert.SECOND_NS:
             self._suspect = number
         elif self._suspect is not None and number < self._suspect:  # numbers go on from before
             self._set_back, self._suspect = self._suspect, None
-            self._wrong_clock(f"GNSS clock was set back by about {(self._set_back - number) * self._period_s:.0f} s")
+            back_s = (self._set_back - number) * self._period_s  # 0 = of two fixes that follow each other none came yet
+            self._wrong_clock("GNSS clock was set back" + (f" by about {back_s:.0f} s" if back_s else ""))
         self._last_fix = number, time_ns
         return False
 

@@ -137,6 +137,16 @@ def test_a_recording_of_a_clock_that_was_set_back_in_flight_is_seen_by_the_numbe
     assert off_m < 3.0 and node.counters["gnss of another clock"] > 50
 
 
+def test_a_clock_that_was_set_back_after_the_first_fixes_is_told_without_a_figure():
+    """It was told as set back by a thousand years: the first fix counted as one a period after 1970."""
+    fixes = [m for m in flight() if m.topic == "sensor/gnss"]
+    later, period_s = fixes[18].stamp_ns, (fixes[1].stamp_ns - fixes[0].stamp_ns) * 1e-9
+    off_s = (fixes[0].stamp_ns - later) * 1e-9 + 0.4 * period_s
+    moved = [shifted(m, off_s, stamp=True) if m.topic == "sensor/gnss" and m.stamp_ns >= later else m for m in flight()]
+    _, events, _ = flown([flight()[0], *sorted(moved[1:], key=lambda m: m.stamp_ns)])
+    assert any("GNSS clock was set back: GNSS is left out" in text for text in events), events
+
+
 def test_fixes_are_used_again_when_the_clock_is_right_again():
     third = flight()[len(flight()) // 3].stamp_ns
     wrong = (third, third + 6 * SECOND)
