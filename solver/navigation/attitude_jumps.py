@@ -8,6 +8,7 @@ where the attitude was; or, where it has gone on from itself for `STAYS_S`, it i
 
 from __future__ import annotations
 
+from collections import deque
 from math import pi, radians
 
 import numpy as np
@@ -22,6 +23,8 @@ STAYS_S = 0.5
 #: After a silence of so many seconds an aircraft may have turned to anywhere.
 SILENCE_S = 0.5
 
+#: The longest of so many steps is how far samples are apart: they may come in bursts (tuned).
+RECENT = 16
 #: Roll, pitch and heading, rad.
 Angles = tuple[float, float, float]
 
@@ -37,7 +40,7 @@ class AttitudeJumps:
     def __init__(self) -> None:
         self.by_deg = 0.0
         self._used: tuple[float, Angles] | None = None
-        self._step_s = 0.0
+        self._steps_s: deque[float] = deque(maxlen=RECENT)
         self._newest_s = -np.inf
         self._jumped: tuple[float, float, Angles] | None = None  # since when, and the newest of these
 
@@ -53,13 +56,13 @@ class AttitudeJumps:
         if time_s <= newest_s:
             return False  # told by who puts them in order
         if self._used is None or time_s - newest_s > SILENCE_S:
-            self._use(time_s, angles, 0.0)
+            self._use(time_s, angles)
             return False
+        self._steps_s.append(time_s - newest_s)
         used_s, used = self._used
-        step_s = self._step_s or time_s - used_s
         turn = turn_between(used, angles)
-        if turn <= LARGEST_SCATTER + LARGEST_RATE * min(time_s - used_s, step_s):
-            self._use(time_s, angles, time_s - newest_s)
+        if turn <= LARGEST_SCATTER + LARGEST_RATE * min(time_s - used_s, max(self._steps_s)):
+            self._use(time_s, angles)
             return False
         self.by_deg = np.degrees(turn)
         since_s, last_s, last = self._jumped or (time_s, time_s, angles)
@@ -68,11 +71,11 @@ class AttitudeJumps:
         self._jumped = since_s, time_s, angles
         if time_s - since_s < STAYS_S:
             return True
-        self._use(time_s, angles, time_s - newest_s)
+        self._use(time_s, angles)
         return False
 
-    def _use(self, time_s: float, angles: Angles, step_s: float) -> None:
-        self._used, self._step_s, self._jumped = (time_s, angles), step_s, None
+    def _use(self, time_s: float, angles: Angles) -> None:
+        self._used, self._jumped = (time_s, angles), None
 
 
 def turn_between(one: Angles, other: Angles) -> float:

@@ -50,6 +50,18 @@ def test_after_a_silence_an_aircraft_may_have_turned_to_anywhere():
     assert not left_out(t[kept], rpy[kept]).any()
 
 
+@pytest.mark.parametrize("kept", ["in bursts", "with gaps"])
+def test_a_fast_turn_in_samples_at_irregular_times_is_no_jump(kept):
+    """A multicopter that yaws by 250 deg/s."""
+    t = np.arange(0.0, 6.0, 0.005)
+    if kept == "in bursts":
+        t = 0.04 * np.floor(t / 0.04) + 1e-4 * (np.arange(len(t)) % 8)
+    else:
+        t = t[np.random.default_rng(5).random(len(t) // 40).repeat(40) > 0.3]  # now and then nothing for 0.2 s
+    rpy = np.stack([5.0 * np.sin(t), np.zeros_like(t), (250.0 * t) % 360.0], axis=1)
+    assert not left_out(t, rpy).any()
+
+
 def test_attitudes_out_of_order_are_told_by_others():
     t, rpy = flown(100.0)
     jumps = AttitudeJumps()
