@@ -234,7 +234,7 @@ class DriftMonitor:
     @property
     def is_suspicious(self) -> bool:
         """Whether the last test has failed and nothing is named yet."""
-        return not self.biased and bool(self._suspicion.strongest > self._limit)
+        return not self.biased and bool(self._limit < self._suspicion.strongest < np.inf)
 
     def test(self, now_s: float, of_all: bool = True, instead: float = 0.0) -> None:
         """Test with what is in the border, of all batches of the strip; the state is solved.
