@@ -176,7 +176,7 @@ def at_pace(tables: Tables, pace: str) -> Tables:
 def _check(reader: RecordingReader, args: argparse.Namespace) -> None:
     refuse_unless_writable(args.output)
     if not any(channel.known for channel in reader.channels.values()):
-        raise UserError(f"{args.recording}: no topic of triline in it")
+        raise lacking(reader, "no topic of triline in it")
     if args.strict and (reader.damage or not reader.complete):
         raise UserError(f"{args.recording}: not whole: {not_whole(reader)[0]}")
 

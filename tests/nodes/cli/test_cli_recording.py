@@ -326,6 +326,8 @@ def test_process_refuses_in_one_line(capsys, flight, tmp_path):
         writer.finish()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(flight.read_bytes()[:-100])
+    begun = tmp_path / "begun.mcap"
+    begun.write_bytes(flight.read_bytes()[:9])
     longer = tmp_path / "longer.mcap"
     longer.write_bytes(flight.read_bytes() + bytes(700))
     configured = write_recording(tmp_path / "configured.mcap", [sample.message("configuration/camera")])
@@ -334,6 +336,7 @@ def test_process_refuses_in_one_line(capsys, flight, tmp_path):
     for arguments, text in (
         ((flight, "-o", flight), "would overwrite the recording"),
         ((ros, "-o", out), "no topic of triline in it"),
+        ((begun, "-o", out), "no topic of triline in it (the file ends inside a record at byte 8"),
         ((cut, "-o", out, "--strict"), "not whole: "),
         ((longer, "-o", out, "--strict"), "not whole: bytes behind the end of the recording"),
         ((configured, "-o", out), "nothing to process for navigator,adjuster: it holds configuration/camera"),
