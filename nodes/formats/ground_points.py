@@ -90,9 +90,8 @@ def read_ground_table(path: Path, crs: str, notes: list[str], *, may_be_empty: b
             f"{path}:{skip + 1}: a list of OpenDroneMap (gcp_list.txt), with pixels of frame images and no sigmas, "
             "wanted a header with point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m"
         )
-    ours = (
-        {"enabled", "type"} if "role" in header else set[str]()
-    )  # what stands for columns that are there says nothing
+    # what stands for columns that are there says nothing
+    ours = {"enabled", "type"} if "role" in header else set[str]()
     ours |= {"accuracy", "level_accuracy"} if set(_SIGMAS) <= set(header) else set()
     wanted = [column for column in _COLUMNS if column.name not in ours]
     columns = [_as_headed(column, header, crs, f"{path}:{skip + 1}") for column in wanted]

@@ -22,7 +22,6 @@ LARGEST_RATE, LARGEST_SCATTER = radians(500.0), radians(3.0)
 STAYS_S = 0.5
 #: After a silence of so many seconds an aircraft may have turned to anywhere.
 SILENCE_S = 0.5
-
 #: The longest of so many steps is how far samples are apart: they may come in bursts (tuned).
 RECENT = 16
 #: Roll, pitch and heading, rad.
